@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import Array, PyTree
 
 # Users' objects, which are written for a single run, with their arrays as separate numbers.
 
@@ -370,20 +370,14 @@ def differences(modules: list[Any], unit: Unit = None) -> list[list[str]]:
             name, factor = in_unit(getattr(modules[0], "units", {}).get(field.name, "1"), unit)
             if factor != 1.0:
                 # 0.1 rad is 5.73 deg, not 5.72958.
-                values = [
-                    jax.tree.map(lambda number, factor=factor: _rounded(factor * number), value) for value in values
-                ]
+                rounded = np.vectorize(lambda number, factor=factor: float(f"{factor * number:.4g}"), otypes=[float])
+                values = [jax.tree.map(rounded, value) for value in values]
             texts = [
                 f"no {field.name}" if value is None else f"{field.name} {as_text(value, name)}" for value in values
             ]
             parts = [[text] if len(set(texts)) > 1 else [] for text in texts]
         labels = [label + part for label, part in zip(labels, parts, strict=True)]
     return labels
-
-
-def _rounded(number: ArrayLike) -> np.ndarray:
-    """A number to four digits."""
-    return np.vectorize(lambda part: float(f"{part:.4g}"))(np.asarray(number, float))
 
 
 def as_html(title: str, rows: list[tuple[str, ...]]) -> str:

@@ -49,11 +49,6 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
     warnings.warn_explicit(message, category, *place, registry)
 
 
-def is_called_by_a_user() -> bool:
-    """Whether a user's line led here; in a thread that we have started, none does."""
-    return _users_frame() is not None
-
-
 def _users_frame() -> FrameType | None:
     """The innermost frame of a user's code."""
     frame: FrameType | None = sys._getframe(2)
@@ -448,7 +443,7 @@ class Bounded(eqx.Module, metaclass=Explaining):
         self._require_one_shape()
         require_all(self.bounds())
         # Copies that our threads make of the user's modules repeat no warning.
-        if (suspicion := self.suspicion()) is not None and is_called_by_a_user():
+        if (suspicion := self.suspicion()) is not None and _users_frame() is not None:
             warn(suspicion)
 
     def _require_one_shape(self) -> None:

@@ -12,7 +12,6 @@ from .frames import PlaneFrame as PlaneFrame
 from .frames import Tangent as Tangent
 from .frames import frame_of as frame_of
 from .frames import place_named as place_named
-from .frames import rate_in_frame as rate_in_frame
 from .frames import room_bounds as room_bounds
 from .level_sets import Graph as Graph
 from .level_sets import Implicit as Implicit
@@ -37,6 +36,7 @@ from .vector import inverse as inverse
 from .vector import multiply as multiply
 from .vector import none_if_zero as none_if_zero
 from .vector import planar_length as planar_length
+from .vector import rate_in_frame as rate_in_frame
 from .vector import scale as scale
 from .vector import solve as solve
 from .vector import stacked as stacked

@@ -3,7 +3,7 @@
 The ball touches the surface at its foot; its centre is at a distance R from there along n, on the parallel surface.
 With V the velocity of the centre, the frame turns as t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2), where (o1, o2) = S
 V and S is the shape operator of the parallel surface, positive where it is concave towards the ball. The frame does not
-turn about n, so the components of a fixed vector change as `rate_in_frame` states.
+turn about n, so the components of a fixed vector change as `vector.rate_in_frame` states.
 
 The frame of a convex body of any shape moves with its contact point: R = 0, and V is that point's velocity along the surface
 (`AbstractFrame.convex_motion`).
@@ -32,6 +32,7 @@ from .vector import (
     dot,
     multiply,
     planar_length,
+    rate_in_frame,
     scale,
     subtract,
     sum_vectors,
@@ -43,12 +44,6 @@ from .vector import (
 Tangent: TypeAlias = tuple[Component, Component]
 #: The components 11, 12 and 22 of a symmetric operator on the tangent plane.
 TangentOperator: TypeAlias = Vector
-
-
-def rate_in_frame(vector: Vector, frame_rate: Tangent) -> Vector:
-    """Rate of the components of a fixed vector in a moving frame with t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2)."""
-    along_normal = dot(frame_rate, vector[:2])
-    return (multiply(frame_rate[0], vector[2]), multiply(frame_rate[1], vector[2]), subtract(None, along_normal))
 
 
 def contact_velocity(

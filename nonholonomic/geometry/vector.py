@@ -80,6 +80,12 @@ def cross(left: Vector, right: Vector) -> Vector:
     )
 
 
+def rate_in_frame(vector: Vector, frame_rate: Vector) -> Vector:
+    """Rate of the components of a fixed vector in a moving frame with t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2)."""
+    along_normal = dot(frame_rate, vector[:2])
+    return (multiply(frame_rate[0], vector[2]), multiply(frame_rate[1], vector[2]), subtract(None, along_normal))
+
+
 def sum_vectors(*vectors: Vector) -> Vector:
     """Sum of vectors of the same length."""
     return tuple(add(*components) for components in zip(*vectors, strict=True))

@@ -261,11 +261,21 @@ def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array,
 
 @eqx.filter_jit
 def _start(
-    problem: AbstractProblem, time: Float[Array, ""]
-) -> tuple[Float[Array, " components"], Float[Array, " components"], Float[Array, ""] | None]:
-    """State, scales and domain margin at the start: one program, where JAX would compile each of their operations."""
-    state, scales = problem.start()
-    return jnp.asarray(state), jnp.asarray(scales), problem.margin_at_start(time, state)
+    problem: AbstractProblem, t0: Float[Array, ""], t1: Float[Array, ""], settings: Settings, dense: bool
+) -> tuple[Float[Array, " components"], Float[Array, " components"], Float[Array, ""] | None, Float[Array, ""]]:
+    """State, scales and domain margin at the start, and the length of the first step [s] that Diffrax selects: one program,
+    where JAX would compile each of their operations."""
+    state, scales = map(jnp.asarray, problem.start())
+    margin = problem.margin_at_start(t0, state)
+    solver = settings.for_single_runs if dense or margin is not None else settings.for_steps_alone
+    field, control = _field(problem, t0, state), _control(problem, settings, state, scales)
+    end, _ = control.init(field, t0, t1, state, None, problem, solver.func, solver.error_order(field))
+    return state, scales, margin, jnp.asarray(end) - t0
+
+
+def _field(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array, " components"]) -> diffrax.ODETerm:
+    """The field for Diffrax, whose argument is the problem: traced once, where Diffrax would trace it several times."""
+    return diffrax.ODETerm(eqx.filter_closure_convert(lambda *args: problem.field(*args[:2]), time, state, problem))
 
 
 def _control(
@@ -300,7 +310,7 @@ def _solved(
 
     **Arguments:** `times`: start, end and length of the first step [s]; `options`: of `diffrax.diffeqsolve`.
     """
-    field = diffrax.ODETerm(lambda t, y, args: args.field(t, y))
+    field = _field(problem, jnp.asarray(times[0], state.dtype), state)
     options = {"args": problem, "stepsize_controller": control, "throw": False, **options}
     return diffrax.diffeqsolve(field, solver, *times, state, **options)
 
@@ -310,16 +320,17 @@ def _piece(
     problem: AbstractProblem,
     t0: Float[Array, ""],
     t1: Float[Array, ""],
-    first: Float[Array, ""] | None,
+    first: Float[Array, ""],
     state: Float[Array, " components"],
     scales: Float[Array, " components"],
     settings: Settings,
     dense: bool,
+    is_watched: bool,
 ) -> tuple[diffrax.Solution, Float[Array, "steps 2"] | None]:
     """Integrate as many steps as the settings allow; also bracket the first zero of the domain margin in each step."""
-    is_watched = problem.domain_margin(t0, state) is not None
+    margin = eqx.filter_closure_convert(functools.partial(_guard, problem), t0, state) if is_watched else None
     solver = settings.for_single_runs if dense or is_watched else settings.for_steps_alone
-    event = diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if is_watched else None
+    event = None if margin is None else diffrax.Event(lambda t, y, args, **_: margin(t, y) < 0.0)
     options = {"saveat": diffrax.SaveAt(t0=True, steps=True, dense=dense or is_watched), "event": event}
     control = _control(problem, settings, state, scales)
     solution = _solved(problem, solver, (t0, t1, first), state, control, max_steps=settings.max_steps, **options)
@@ -388,18 +399,19 @@ def follow(
     >>> print(path.at(np.array([0.5, 1.0])).round(6))  # exp(-1), exp(-2)
     [[0.367879 0.135335]]
     """
-    state, scales, margin = _start(problem, jnp.asarray(t0, float))
-    time = jnp.asarray(t0, state.dtype)
+    time, end = jnp.asarray(t0, float), jnp.asarray(t1, float)
+    state, scales, margin, length = _start(problem, time, end, settings, dense)
+    length = length if first is None else jnp.asarray(first, float)
     times, states, segments = [np.full(1, t0)], [np.asarray(state)[:, None]], []
-    accepted = rejected = 0
-    end, lost, failed = jnp.asarray(t1, state.dtype), False, False
-    length = None if first is None else jnp.asarray(first, state.dtype)
+    accepted, rejected, lost, failed = 0, 0, False, False
     # The program is compiled for this number of steps, so it must not change with the number that is left.
     piece_settings = dataclasses.replace(settings, max_steps=min(piece, settings.max_steps))
     if margin is not None and float(margin) <= 0.0:
         return DenseSolution(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
-        solution, brackets = _piece(problem, time, end, length, state, scales, piece_settings, dense)
+        solution, brackets = _piece(
+            problem, time, end, length, state, scales, piece_settings, dense, margin is not None
+        )
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
         ts, ys = saved(solution)

@@ -724,10 +724,11 @@ class ExtendedProblem(AbstractDerivedProblem, Generic[Core]):
         return jnp.concatenate([states, self.values]), jnp.concatenate([scales, self.scales])
 
     def field(self, time: Lanes, state: States) -> States:
-        return self.passive.rates(self.problem, time, self.inner(state), state[self.leading :])
+        core = self.inner(state)
+        return self.passive.rates(self.problem, time, core, state[len(core) :])
 
     def inner(self, state: States) -> States:
-        return state[: self.leading]
+        return state[: len(state) - len(self.values)]
 
     def event_function(self, state: States) -> Lanes | None:
         return super().event_function(state) if self.ends_on_event else None

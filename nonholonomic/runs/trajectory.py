@@ -293,19 +293,15 @@ def show(run: "Trajectory", number: int, centre: np.ndarray, scale: np.ndarray) 
     is_reached = np.all(np.isfinite(np.asarray(run.state)), axis=-1)
     points = ((plane_points(run) - centre) * scale)[is_reached]
     position = np.concatenate([points, np.full((len(points), 1), RADIUS)], axis=-1)
-    upright, ball = np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1)), octahedron(colour)
+    # An octahedron stands for the point.
+    vertices = RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
+    corners = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
+    upright, ball = np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1)), Mesh(vertices, np.array(corners), colour)
     curves = tuple(Curve(name, np.asarray(run[name])[is_reached]) for name in run.names)
     trace = Trace(" over ".join(run.portrait_axes[::-1]), position, colour, WIDTH)
     normal = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     body = Body("state", position, upright, (ball,))
     return Show(f"run {number + 1}", colour, np.asarray(run.t)[is_reached], normal, HALF, (body,), (trace,), (), curves)
-
-
-def octahedron(colour: int) -> Mesh:
-    """The drawn point."""
-    vertices = RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
-    corners = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
-    return Mesh(vertices, np.array(corners), colour)
 
 
 def plane(scale: np.ndarray) -> Arena:

@@ -16,6 +16,7 @@ from nonholonomic.compilation.xla_cpu import least, stored, stored_with_tangents
 from nonholonomic.geometry import (
     AbstractFrame,
     Component,
+    PlaneFrame,
     Tangent,
     Vector,
     add,
@@ -281,7 +282,8 @@ class Dynamics(AbstractContactDynamics):
 
     def unloaded(self, state: States, scales: States) -> Bool[Array, "..."] | None:
         # On a level plane, N = 0 can last only for an instant.
-        return None if self.turns is not None else super().unloaded(state, scales)
+        frame = self.frame
+        return None if isinstance(frame, PlaneFrame) and frame.slope is None else super().unloaded(state, scales)
 
     def motion(self, state: States) -> Motion:
         """Evaluate the equations of motion, solving for the normal force with friction included.

@@ -41,7 +41,6 @@ from ..modes.plane import Slide
 from .launches import check_reversible, check_run, event_of
 from .model import TopModel
 from .observables import OF_RIGID_BODIES, QUANTITIES, AbstractTrajectory, names_of
-from .trajectory import Trajectory
 
 # The drawing of a run: body, trace of the contact, path of the axis, arrows, and curves over time.
 
@@ -301,7 +300,11 @@ def _(model: TopModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, vie
     live = page_of_launch(model, sliders, t1)
     if model.scene.contact == "hybrid" and model.scene.level:
         return live, stage_at_start(model, t1)
-    return live, stage_of_runs(runs_at_ends(model, live.sliders, t1))
+    # The first run, on a part of the arena that also contains the others.
+    runs = runs_at_ends(model, live.sliders, t1)
+    (first,), surface, size = runs[0].stages(), runs[0].scene.surface, float(runs[0].scene.body.size)
+    points = np.concatenate([motion(run).contact for run in runs])
+    return live, first._replace(arena=views.arena(surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 
 def page_of_launch(model: TopModel, sliders: Sliders | None, t1: float) -> LiveRun:
@@ -365,13 +368,6 @@ def outcome(model: TopModel, problem: AbstractProblem | None, ended: Any) -> tup
     for code, word in ((Status.EVENT, Status.INVERTED), (Status.COMPLETED, Status.NOT_INVERTED)):
         status = jnp.where(status == int(code), int(word), status)
     return status, jnp.where(ended.status[0] == CROSSED, time[0], jnp.inf)
-
-
-def stage_of_runs(runs: list[Trajectory]) -> views.Stage:
-    """The first run, on a part of the arena that also contains the others."""
-    (first,), scene = runs[0].stages(), runs[0].scene
-    points, size = np.concatenate([motion(run).contact for run in runs]), float(scene.body.size)
-    return first._replace(arena=views.arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 
 def stage_at_start(model: TopModel, t1: float) -> views.Stage:
