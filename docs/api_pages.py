@@ -33,7 +33,7 @@ ENGINE_ROOMS = tuple(
 
 #: The public numbers and types of the engine; the docstrings of the rooms say what they mean.
 CONSTANTS = [
-    *of("nonholonomic.integration", "Lanes States"),
+    *of("nonholonomic.integration", "Components Lanes States"),
     *of("nonholonomic.integration.problem", "RUNNING REACHED_END CROSSED LEFT_DOMAIN FAILED UNRESOLVED"),
     *of("nonholonomic.integration.problem", "DEFAULT_MAX_STEPS MOST_STEPS"),
     "nonholonomic.integration.problem.TIGHTEST",

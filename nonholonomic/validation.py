@@ -14,11 +14,11 @@ import sys
 import tempfile
 import uuid
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -77,8 +77,17 @@ UNTRACEABLE = (
 #: A number or numbers with which others are compared, or `None`.
 Limit = Any
 
+#: Numbers as users write them: a number, an array, or a list of numbers or of rows.
+ArrayOrList: TypeAlias = ArrayLike | Sequence[float] | Sequence[Sequence[float]]
 
-def as_number(value: object) -> Float[Array, "..."]:
+#: An array, or something else that `require` will reject.
+if TYPE_CHECKING:
+    Converted: TypeAlias = Float[Array, "..."]
+else:
+    Converted = object
+
+
+def as_number(value: object) -> Converted:
     """Convert to a floating-point array of the default precision; anything that is not a number stays unchanged, for
     `require` to reject."""
     try:
@@ -88,16 +97,15 @@ def as_number(value: object) -> Float[Array, "..."]:
                 raise TypeError
         return jnp.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        # The types exclude what `require` will reject.
         return value  # pyright: ignore[reportReturnType]
 
 
-def as_number_or_none(value: object) -> Float[Array, "..."] | None:
+def as_number_or_none(value: object) -> Converted | None:
     """Like `as_number`, for an optional number."""
     return None if value is None else as_number(value)
 
 
-def as_known(value: object) -> Float[Array, "..."]:
+def as_known(value: object) -> Converted:
     """Like `as_number`, but a concrete number stays concrete inside a transformation, where `jax.jit` would trace an
     array."""
     if is_traced(value):
@@ -118,7 +126,7 @@ def largest(*values: PyTree) -> float:
     return max((float(np.max(array)) for array in arrays if array.size and np.isfinite(array).all()), default=0.0)
 
 
-def _first(numbers: np.ndarray, holds: np.ndarray) -> str:
+def _first(numbers: np.ndarray, holds: np.ndarray | np.bool_) -> str:
     """The first number for which the condition is false."""
     return shown(numbers[~holds].ravel()[0]) if numbers.ndim else shown(numbers)
 
@@ -251,7 +259,7 @@ def require_increasing(values: Any, name: str) -> None:
         )
 
 
-def times_within(times: ArrayLike, end: ArrayLike, run: str) -> Float[np.ndarray, " times"]:
+def times_within(times: ArrayOrList, end: ArrayLike, run: str) -> Float[np.ndarray, " times"]:
     """Convert times of output, or one time, to a list; raise `ValueError` unless they increase and lie within [0, `end`].
     **Arguments:** `end`: end of the run [s]; `run`: the word for the run in the message."""
     require(times, "times", at_least=0.0, at_most=end, why=f"the {run} ends there")
@@ -510,7 +518,7 @@ def legal(bounds: Iterable[Bound]) -> Bool[Array, "..."]:
     return functools.reduce(jnp.logical_and, (bound.holds for bound in bounds), jnp.asarray(True))
 
 
-def nan_unless(holds: Bool[Array, ""], tree: PyTree) -> PyTree:
+def nan_unless(holds: Bool[Array, "..."], tree: PyTree) -> PyTree:
     """The tree with every floating-point number, and every derivative through it, NaN unless `holds`."""
     # Multiply instead of selecting: the derivative of a value that was not selected would be 0.
     factor = jnp.where(holds, 1.0, jnp.nan)

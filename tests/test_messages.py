@@ -467,7 +467,7 @@ def test_an_unknown_quantity_of_a_run_is_answered_by_a_likely_one():
 def test_an_error_within_a_quantity_of_a_run_is_not_hidden():
     """Python asks for an attribute again where a property raises the error of a missing one."""
     with pytest.raises(AttributeError, match="'str' object has no attribute"):
-        _ = eqx.tree_at(lambda run: run.scene, run_of_nothing(), "no scene").theta
+        _ = eqx.tree_at(lambda run: run.scene.body, run_of_nothing(), "no body").energy
 
 
 @pytest.mark.parametrize("package", ["tippe", "stroller"])

@@ -230,8 +230,9 @@ class InversionTimes(AbstractTimes):
         # Predictions continue smoothly beyond it.
         return self.t1
 
-    def model(self, system: Scene) -> TopModel:
+    def model(self, system: object) -> TopModel:
         require_kind(system, "scene", Scene)
+        assert isinstance(system, Scene)
         return TopModel.timed(system, self.launch, event_of(system, self.angle))
 
     def predicted(self, model: TopModel, t1: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
@@ -266,8 +267,9 @@ class ReversalTimes(AbstractTimes):
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s"}
 
-    def model(self, system: Scene) -> TopModel:
+    def model(self, system: object) -> TopModel:
         require_kind(system, "scene", Scene)
+        assert isinstance(system, Scene)
         require_rigid(system)
         check_reversible(self.launch, {})
         return TopModel.timed(system, self.launch, None)
@@ -400,9 +402,10 @@ class Recording(AbstractRecording):
     quantity: str | tuple[str, ...] = eqx.field(static=True, default="theta", converter=as_quantity)
     quantities: ClassVar[Quantities] = QUANTITIES
 
-    def model(self, scene: Scene) -> AbstractModel:
+    def model(self, scene: object) -> AbstractModel:
         """The model of the recorded run."""
         require_kind(scene, "data: the scene of a tippe.Recording", Scene)
+        assert isinstance(scene, Scene)
         return TopModel(scene=scene, launch=self.launch)
 
     def __check_init__(self):

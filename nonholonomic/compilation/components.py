@@ -276,9 +276,7 @@ def _is_risky(name: str, operands: Sequence[Element], params: dict[str, Any]) ->
     """Whether the result of an operation may not be finite though its operands are."""
     if name == "div" and _is_constant(operands[1]):
         return operands[1] == 0.0
-    if name == "integer_pow":
-        return params["y"] < 0
-    return name in RISKY.split()
+    return params["y"] < 0 if name == "integer_pow" else name in RISKY.split()
 
 
 def _simplified(name: str, operands: Sequence[Element]) -> Element | None:
@@ -385,13 +383,13 @@ def spelled_out(function: Function) -> Function:
     return evaluated
 
 
-def _spelled_out(equation: Equation, inputs: list[Array]) -> Sequence[Array]:
+def _spelled_out(equation: Equation, inputs: list[ArrayLike]) -> Sequence[ArrayLike]:
     name, params = equation.primitive.name, equation.params
     if name in ("jit", "pjit"):
         return read_program(params["jaxpr"], inputs, _spelled_out)
     if name == "dot_general":
         (_, right_sums), (_, right_batch) = params["dimension_numbers"]
-        left, right = inputs
+        left, right = map(jnp.asarray, inputs)
         columns = (size for k, size in enumerate(right.shape) if k not in (*right_sums, *right_batch))
         if left.size * math.prod(columns) <= MOST_TERMS:
             return [summed_products(left, right, params["dimension_numbers"])]

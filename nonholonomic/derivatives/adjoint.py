@@ -377,7 +377,7 @@ class Weights(NamedTuple):
     """
 
     fractions: Float[np.ndarray, " stages"]
-    rows: tuple[Float[np.ndarray, " before"], ...]
+    rows: tuple[Float[np.ndarray, " _"], ...]
     shares: Float[np.ndarray, "stages 1+stages"]
 
     @classmethod
@@ -402,7 +402,7 @@ class StageMemory(NamedTuple):
     """
 
     states: Stages
-    rates: Stages
+    rates: Array
     adjoints: Stages
 
 
@@ -435,7 +435,7 @@ def step_taken_back(
     stages = len(weights.fractions)
     fractions = jnp.asarray(weights.fractions)
 
-    def stage_made(stage: Int[Array, ""], carry: tuple[Stages, Stages]) -> tuple[Stages, Stages]:
+    def stage_made(stage: Int[Array, ""], carry: tuple[Stages, Array]) -> tuple[Stages, Array]:
         stage_states, rates = carry
         rate = problem.field(time + fractions[stage] * length, read(stage_states, index=stage))
         rates = written_by_component(rates, rate, at=stage)

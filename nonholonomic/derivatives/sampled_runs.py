@@ -447,7 +447,7 @@ def core_problem(problem: AbstractProblem) -> AbstractProblem:
 Samples = tuple[Float[Array, "*cells times components"], Float[Array, "*cells times quadratures"] | None]
 
 
-def parted(problem: AbstractProblem, states: Float[Array, "*cells times components"]) -> Samples:
+def parted(problem: AbstractProblem, states: Float[Array, "*cells times all"]) -> Samples:
     """Split states into the core components and the passive quadratures."""
     if problem.leading is None:
         return states, None

@@ -233,10 +233,10 @@ class VariationalProblem(AbstractDerivedProblem):
         variations = [variation(direction) for direction in self.tangents]
         return jnp.concatenate([states, *variations]), jnp.concatenate([scales] * (1 + len(variations)))
 
-    def field(self, time: Lanes, state: States) -> States:
-        point, *variations = self.parts(state)
-        if not variations:
-            return self.problem.field(time, point)
+    def field(self, time: Lanes, state: States | tuple[Lanes, ...]) -> States:
+        if not self.tangents:
+            return self.problem.field(time, state)
+        point, *variations = self.parts(jnp.asarray(state))
         return self._varied(lambda problem, point: problem.field(time, point), point, variations)
 
     def _varied(
@@ -256,7 +256,7 @@ class VariationalProblem(AbstractDerivedProblem):
     def event_function(self, state: States) -> Lanes | None:
         return super().event_function(state) if self.ends_on_event else None
 
-    def inner(self, state: States) -> States:
+    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
         return self.parts(state)[0]
 
     def across_jump(self, time: Lanes, state: States) -> States:
@@ -265,7 +265,7 @@ class VariationalProblem(AbstractDerivedProblem):
             return self.problem.across_jump(time, point)
         return self._varied(lambda problem, point: problem.across_jump(time, point), point, variations)
 
-    def parts(self, state: Float[Array, "components ..."]) -> list[Float[Array, "components ..."]]:
+    def parts(self, state: States) -> list[Float[Array, "inner *lanes"]]:
         """The state and its variations."""
         return jnp.split(state, 1 + len(self.tangents)) if self.tangents else [state]
 

@@ -176,9 +176,7 @@ class PlaneFrame(AbstractFrame):
         return (None, None, 1.0) if self.slope is None else (self.slope[0], None, self.slope[1])
 
     def height(self, place: Place) -> Component:
-        if self.slope is None:
-            return self.distance
-        return self.slope[0] * place[0] + self.slope[1] * self.distance
+        return self.distance if self.slope is None else self.slope[0] * place[0] + self.slope[1] * self.distance
 
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         return velocity[2 - len(cyclic) :]
@@ -337,9 +335,7 @@ def place_named(surface: AbstractSurface, place: Place) -> Place:
 
     **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
     """
-    if len(place) == 2 and surface.coordinates[0][0] == "mu":
-        return (place[0], place[1] - 0.5 * jnp.pi)
-    return place
+    return (place[0], place[1] - 0.5 * jnp.pi) if len(place) == 2 and surface.coordinates[0][0] == "mu" else place
 
 
 def frame_of(

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..compilation.components import held, map_methods
 from ..text import shown
@@ -531,7 +531,7 @@ class Spheroid(AbstractQuadric):
         yield Bound(self.polar, "polar", above=0.0)
 
     @classmethod
-    def from_oblate(cls, a: Float[Array, "..."], xi: Float[Array, "..."]) -> "Spheroid":
+    def from_oblate(cls, a: ArrayLike, xi: ArrayLike) -> "Spheroid":
         """The spheroid of constant xi in oblate spheroidal coordinates: A = a cosh xi, c = a sinh xi.
 
         **Arguments:**

@@ -45,9 +45,7 @@ def add(*terms: Component) -> Component:
 
 def subtract(left: Component, right: Component) -> Component:
     """Difference `left - right` of two components."""
-    if right is None:
-        return left
-    return -right if left is None else left - right
+    return left if right is None else -right if left is None else left - right
 
 
 def multiply(*factors: Component) -> Component:
@@ -101,7 +99,7 @@ def unit(vector: Vector) -> Vector:
     return scale(1.0 / jnp.sqrt(dot(vector, vector)), vector)
 
 
-def stacked(vector: Vector, example: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+def stacked(vector: Vector, example: Array | Vector) -> Float[Array, "components ..."]:
     """The components along axis 0, in the shape of the components of `example`, with zeros for those that vanish
     identically."""
     zero = jnp.zeros_like(example[0])

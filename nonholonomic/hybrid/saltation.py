@@ -51,11 +51,11 @@ class Clock(AbstractPassive):
     """The time since a mode began, as a passive component. The variation of this component is the variation of the time
     at which the mode began."""
 
-    def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: States) -> States:
+    def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: Array) -> Array:
         return jnp.concatenate([problem.field(time, state), jnp.ones_like(passive)])
 
 
-def with_row(state: States, row: Lanes) -> States:
+def with_row(state: States, row: Lanes) -> Float[Array, "components+1 *lanes"]:
     """A state with one more component."""
     return jnp.concatenate([state, row[None]])
 
@@ -208,7 +208,7 @@ class VariationalMode(AbstractBatchedMode):
         directions = self.directions([part[:-1] for part in variations], [part[-1] for part in variations])
         return along(time, point, directions)[1]
 
-    def parts(self, state: States) -> list[States]:
+    def parts(self, state: States) -> list[Float[Array, "inner *lanes"]]:
         """The state with its clock, and the variations of both."""
         return jnp.split(state, 1 + len(self.tangents))
 
@@ -263,7 +263,7 @@ def variational_modes(
     )
 
 
-def variational_start(state: States, tangents: Tangents) -> States:
+def variational_start(state: States, tangents: Tangents) -> Float[Array, "variational *lanes"]:
     """Initial states with their clocks, followed by the variations of both."""
     zero = jnp.zeros_like(state[0])
     variations = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]

@@ -35,7 +35,7 @@ from ..derivatives.sampled_runs import (
 )
 from ..derivatives.variation import Tangent, by_active, where_active
 from ..derivatives.variation import over_cells as with_cells
-from ..integration import AbstractProblem, Jumps, Lanes, Settings, States
+from ..integration import AbstractProblem, Components, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
 from ..integration.scheduler import of_cells
 from .ensemble import (
@@ -235,7 +235,7 @@ class EndlessProblem(AbstractProblem):
     def start(self) -> tuple[States, States]:
         return self.whole.start()
 
-    def field(self, time: Lanes, state: States) -> States:
+    def field(self, time: Lanes, state: Components) -> States:
         return self.whole.field(time, state)
 
     def event_function(self, state: States) -> None:

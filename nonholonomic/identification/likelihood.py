@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..parameters import full_name
 from ..text import shown
-from ..validation import require
+from ..validation import ArrayOrList, require
 
 # Only for type checkers: data stand above measurements.
 if TYPE_CHECKING:
@@ -70,16 +70,16 @@ class Measurements(eqx.Module):
 
     def __init__(
         self,
-        value: ArrayLike,
-        error: ArrayLike,
-        censored: ArrayLike = False,
+        value: ArrayOrList,
+        error: ArrayOrList,
+        censored: ArrayOrList = False,
         *,
-        upper: ArrayLike | None = None,
-        period: ArrayLike = math.inf,
-        student: ArrayLike = math.inf,
-        series: ArrayLike = 0,
-        time: ArrayLike = 0.0,
-        estimated: ArrayLike = False,
+        upper: ArrayOrList | None = None,
+        period: ArrayOrList = math.inf,
+        student: ArrayOrList = math.inf,
+        series: ArrayOrList = 0,
+        time: ArrayOrList = 0.0,
+        estimated: ArrayOrList = False,
     ):
         require(error, "error", above=0.0)
         if np.ndim(value) == 0 or np.size(value) == 0:
@@ -100,7 +100,7 @@ class Measurements(eqx.Module):
             if not np.all(np.asarray(arguments[name]) > 0.0):
                 raise ValueError(f"{name} = {shown(arguments[name])} must be positive, or infinite")
 
-        def each(argument: ArrayLike, kind: type) -> Array:
+        def each(argument: ArrayOrList, kind: type) -> Array:
             return jnp.broadcast_to(jnp.asarray(argument, kind), shape)
 
         self.value, self.upper, self.error = each(value, float), each(upper, float), each(error, float)
@@ -368,9 +368,7 @@ class Unknown(eqx.Module):
             return jnp.log(value - self.lower) - jnp.log(self.upper - value)
         if self.has_lower:
             return jnp.log(value - self.lower)
-        if self.has_upper:
-            return -jnp.log(self.upper - value)
-        return (value - self.start) / self.unit
+        return -jnp.log(self.upper - value) if self.has_upper else (value - self.start) / self.unit
 
 
 def as_free(free: Mapping[str, Free | float], lower: dict[str, float] | None = None) -> dict[str, Free]:

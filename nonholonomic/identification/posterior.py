@@ -1,7 +1,7 @@
 """A model with its free parameters, and the posterior of these as a function of unbounded coordinates."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -249,7 +249,7 @@ def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]
 
 
 @eqx.filter_jit
-def _residuals(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> tuple[Array, Array, Array]:
+def _residuals(measurements: Measurements, prediction: Float[Array, " n"]) -> tuple[Array, Array, Array]:
     residual, slope = jax.jvp(measurements.residuals, (prediction,), (jnp.ones_like(prediction),))
     return residual, slope, measurements.roots_of_information(prediction, slope)
 
@@ -370,7 +370,7 @@ class LogDensity(eqx.Module):
         values = [float(unknown.coordinate(unknown.start)) for unknown in self.problem.unknowns]
         return jnp.array([*values, *(0.0 for _ in self.open_series)])
 
-    def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
+    def values(self, coordinates: Float[Array | np.ndarray, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
         """The unknowns at given coordinates: name -> (...,).
 
         **Arguments:** `coordinates`: the coordinates of all unknowns, or only those of a fit, without the unknown
@@ -426,8 +426,8 @@ class LogDensity(eqx.Module):
         return predicted + np.asarray(errors) * noise
 
     @status_line("simulating")
-    def __call__(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
-        return self.of_prediction(coordinates, self.predict(coordinates[None])[0])
+    def __call__(self, coordinates: Float[Array | np.ndarray, " unknowns"]) -> Float[Array, ""]:
+        return self.of_prediction(jnp.asarray(coordinates), self.predict(jnp.asarray(coordinates)[None])[0])
 
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
         """The log density at given coordinates, for given predictions of the model."""
@@ -437,7 +437,7 @@ class LogDensity(eqx.Module):
 
     @status_line("simulating")
     def value_and_gradient(
-        self, coordinates: Float[Array, "*batch unknowns"]
+        self, coordinates: Float[Array | np.ndarray, "*batch unknowns"] | Sequence[float]
     ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch unknowns"]]:
         """The log density and its gradient, at one point or at a list of them."""
         return _value_and_gradient(self, jnp.asarray(coordinates, float))

@@ -335,7 +335,7 @@ class Minima(NamedTuple):
         points = [best + factor * step for step in steps for factor in (-1.0, 0.5, 2.0)]
         return np.stack([*points, *self.coordinates])[: len(self.starts)]
 
-    def covariance(self, row: int) -> Float[np.ndarray, "unknowns unknowns"]:
+    def covariance(self, row: int | np.integer) -> Float[np.ndarray, "unknowns unknowns"]:
         """The covariance of the coordinates by the slopes at an end."""
         return coordinate_covariance(self.linearised.information[row])
 

@@ -7,7 +7,7 @@ arguments, from `problem`; zeros of functions from `dense`.
 
 A `nonholonomic.AbstractMode` has functions of one state, and the package maps them over cells. An `AbstractProblem` has
 functions of all cells at once: components along the first axis, cells along the last. `Lanes` is the type of one number
-per cell, and `States` the type of the states of all cells.
+per cell, and `States` the type of the states of all cells; `Components` are states that may also come as a tuple.
 
 **Example:** a decay, first as a mode, then as a problem with three cells.
 
@@ -48,6 +48,7 @@ from .problem import ExtendedProblem as ExtendedProblem
 from .problem import Jumps as Jumps
 from .problem import Settings as Settings
 from .problem import crossing_time as crossing_time
+from .runge_kutta import Components as Components
 from .runge_kutta import Lanes as Lanes
 from .runge_kutta import Oscillatory8 as Oscillatory8
 from .runge_kutta import Stabilized8 as Stabilized8

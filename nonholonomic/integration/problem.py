@@ -7,7 +7,7 @@ relative tolerance.
 
 import abc
 import enum
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import diffrax
@@ -31,7 +31,7 @@ from ..validation import (
     require_scalars,
     warn,
 )
-from .runge_kutta import AbstractTunedPair, Lanes, Mask, Oscillatory8, States, lesser
+from .runge_kutta import AbstractTunedPair, Components, Lanes, Mask, Oscillatory8, States, lesser
 
 # Times at which a field jumps or has a kink: a step ends just before such a time, and the next begins just after it.
 #
@@ -149,7 +149,7 @@ class AbstractProblem(eqx.Module):
         """The initial state of every cell, and the magnitudes that scale its absolute errors."""
 
     @abc.abstractmethod
-    def field(self, time: Lanes, state: States) -> States:
+    def field(self, time: Lanes, state: Components) -> States:
         """Rate of change of the state, lane by lane; the state may come as a tuple of its components."""
 
     @abc.abstractmethod
@@ -233,7 +233,7 @@ class AbstractDerivedProblem(AbstractProblem):
     problem: eqx.AbstractVar[AbstractProblem]
 
     @abc.abstractmethod
-    def inner(self, state: States) -> States:
+    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
         """The state of the other problem."""
 
     @property
@@ -289,11 +289,11 @@ class CoreProblem(AbstractDerivedProblem):
         state, scales = self.problem.start()
         return state[: self.size], scales[: self.size]
 
-    def field(self, time: Lanes, state: States) -> States:
+    def field(self, time: Lanes, state: Components) -> States:
         # The compiler drops the omitted components and everything that only they depend on.
         return self.problem.field(time, self.inner(state))[: self.size]
 
-    def inner(self, state: States) -> States:
+    def inner(self, state: Components) -> Float[Array, "inner *lanes"]:
         state = jnp.stack(state) if isinstance(state, tuple) else state
         missing = len(self.problem.start()[0]) - self.size
         return jnp.concatenate([state, jnp.zeros((missing, *state.shape[1:]))])
@@ -613,7 +613,7 @@ def require_run(
     require_scalars(values, lists)
 
 
-def require_times(times: ArrayLike | None, t1: object) -> None:
+def require_times(times: ArrayLike | Sequence[float] | None, t1: object) -> None:
     """Raise `ValueError` unless the times of output are an increasing list within [0, t1].
 
     **Example:**
@@ -686,7 +686,7 @@ class AbstractPassive(eqx.Module):
     """
 
     @abc.abstractmethod
-    def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: States) -> States:
+    def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: Array) -> Array:
         """Rates of change of the problem's state, followed by those of the passive components. Both are computed
         together because they share work."""
 
@@ -727,7 +727,7 @@ class ExtendedProblem(AbstractDerivedProblem, Generic[Core]):
         core = self.inner(state)
         return self.passive.rates(self.problem, time, core, state[len(core) :])
 
-    def inner(self, state: States) -> States:
+    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
         return state[: len(state) - len(self.values)]
 
     def event_function(self, state: States) -> Lanes | None:

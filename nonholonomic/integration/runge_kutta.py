@@ -26,6 +26,8 @@ from ..text import shown
 
 Lanes = Float[Array, "*lanes"]
 States = Float[Array, "components *lanes"]
+#: A state as one array, or as a tuple of its components.
+Components = States | tuple[Lanes, ...]
 Mask = Bool[Array, "*lanes"]
 Integers = Int[Array, "*lanes"]
 Stages = Float[Array, "stages components *lanes"]
@@ -227,7 +229,7 @@ def weighted_sum(weights: Iterable[float], rates: Sequence[States]) -> States:
 
 def moved_state(
     stage: Int[Array, ""],
-    rows: Iterable[Float[np.ndarray, " before"]],
+    rows: Iterable[Float[np.ndarray, " _"]],
     state: States,
     length: Lanes,
     rates: Stages,

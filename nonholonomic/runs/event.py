@@ -177,7 +177,7 @@ class EventProblem(AbstractDerivedProblem):
     def fast(self) -> tuple[bool, bool]:
         return self.problem.fast[0], True
 
-    def inner(self, state: States) -> States:
+    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
         return state[:-1] if len(self.clock) else state
 
     def start(self) -> tuple[States, States]:

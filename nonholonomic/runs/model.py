@@ -19,7 +19,7 @@ from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAI
 from ..parameters import full_name, numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..text import shown
-from ..validation import require_all
+from ..validation import ArrayOrList, require_all
 
 #: A single number, or one for each cell.
 Number: TypeAlias = Array | np.ndarray | float
@@ -285,7 +285,7 @@ def model_of(
 def run_of(
     model: AbstractModel,
     t1: ArrayLike,
-    times: ArrayLike | None,
+    times: ArrayOrList | None,
     tolerance: ArrayLike,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,

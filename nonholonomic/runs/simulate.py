@@ -1,7 +1,7 @@
 """Simulate one run of any model."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -161,7 +161,7 @@ def simulate(
     system: object,
     start: object,
     t1: Float[ArrayLike, ""],
-    times: Float[ArrayLike, " times"] | None = None,
+    times: Float[ArrayLike, " times"] | Sequence[float] | None = None,
     tolerance: Float[ArrayLike, ""] = 1e-9,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -217,7 +217,7 @@ def simulate(
 def simulate_model(
     model: AbstractModel,
     t1: ArrayLike,
-    times: ArrayLike | None,
+    times: ArrayLike | Sequence[float] | None,
     tolerance: ArrayLike,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -262,7 +262,7 @@ class SampledRows(eqx.Module):
     """
 
     rows: Float[Array, "rows times"]
-    passive: Float[Array, "rows times"] | None
+    passive: Float[Array, "passive times"] | None
     mode: Int[Array, " times"] | None
     outcome: HybridOutcome[Array]
 

@@ -534,7 +534,7 @@ class Trajectory(AbstractRun):
             raise KeyError(f"{name!r} must be one of {', '.join(self.names)}")
         return self.state[..., self.names.index(name)]
 
-    def at(self, times: Float[ArrayLike, " times"]) -> "Trajectory":
+    def at(self, times: ArrayLike | Sequence[float]) -> "Trajectory":
         """The same run at other times; the run is repeated.
 
         **Arguments:** `times`: increasing, within [0, `end_time`] [s]; or one time, for a run of one time.

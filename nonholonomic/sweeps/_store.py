@@ -118,8 +118,8 @@ class Stream:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._disk, name)
 
-    def write(self, data: bytes) -> int:
-        """Write all data, unless an earlier call has failed."""
+    def write(self, data) -> int:
+        """Write all data, bytes or a view of an array, unless an earlier call has failed."""
         remainder = memoryview(data)
         with self._postponed():
             while self._error is None and remainder:

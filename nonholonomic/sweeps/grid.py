@@ -10,7 +10,7 @@ import platform
 import threading
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +23,11 @@ from ..validation import require
 # The layout of a table: everything except its numbers, and the division of its cells into chunks.
 
 Values = Shaped[np.ndarray, "..."]
+if TYPE_CHECKING:
+    Tabulated = Values
+else:
+    #: A variable of a table: an array or, for words of a table of one cell, a NumPy string.
+    Tabulated = Values | np.str_
 
 #: The attribute of a table with the long names of its variables; in a file, each variable has its own.
 LONG_NAMES = "long_names"
@@ -100,7 +105,7 @@ class Layout(NamedTuple):
         for name, cells in values.items():
             variables[name][slice(*self.ends(chunk))] = cells
 
-    def shaped(self, name: str, values: Values) -> Values:
+    def shaped(self, name: str, values: Values) -> Tabulated:
         """A variable in the shape of the grid, with words instead of codes."""
         values = values.reshape((*self.shape, *self.inner_shape(name)))
         return np.array([*self.words[name], UNREACHED])[values] if name in self.words else values

@@ -107,9 +107,7 @@ def crashes_reported_by(error: Any) -> int:
         return 1
     # Dask has already given the chunk to other workers.
     distributed = sys.modules.get("distributed")
-    if distributed is not None and isinstance(error, distributed.KilledWorker):
-        return 1 + error.allowed_failures
-    return 0
+    return 1 + error.allowed_failures if distributed is not None and isinstance(error, distributed.KilledWorker) else 0
 
 
 #: Greatest number of dispatched chunks: their results are in memory until they are stored.

@@ -18,7 +18,7 @@ from ..text import as_html, in_unit, likely, readable_unit, require_unit, requir
 from ..validation import as_path, replacing, require_package
 from ..views import draw_portrait, draw_series, draw_table, require_others
 from ._store import MAX_BYTES_IN_MEMORY, Stored, coded, table_path, unfinished, write_file
-from .grid import LONG_NAMES, UNREACHED, Layout, Values, attributes_of, axes_of
+from .grid import LONG_NAMES, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
 
 if TYPE_CHECKING:
     import pandas
@@ -59,13 +59,13 @@ class Table(eqx.Module):
     """
 
     coords: dict[str, Values]
-    variables: Mapping[str, Values]
+    variables: Mapping[str, Tabulated]
     units: dict[str, str]
     attributes: dict[str, Any]
     words: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
     inner: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
 
-    def __getattr__(self, name: str) -> Values:
+    def __getattr__(self, name: str) -> Tabulated:
         # Python calls this only for names that are not fields.
         variables, coords = (object.__getattribute__(self, part) for part in ("variables", "coords"))
         for names in (variables, coords):
@@ -73,7 +73,7 @@ class Table(eqx.Module):
                 return names[name]
         raise AttributeError(f"the table has no {name!r}; it has {', '.join([*variables, *coords])}")
 
-    def __getitem__(self, name: str) -> Values:
+    def __getitem__(self, name: str) -> Tabulated:
         if not isinstance(name, str):
             names = ", ".join(self)
             raise ValueError(f"table[{name!r}]: {name!r} must be the name of a variable or an axis: {names}")
@@ -399,9 +399,7 @@ def concise(value: float, error: float) -> str:
     digit = math.ceil(error / 10.0**place * (1.0 - 1e-12))
     if digit == 10:
         place, digit = place + 1, 1
-    if place > 0:
-        return f"{round(value, -place):.0f}({digit * 10**place})"
-    return f"{value:.{-place}f}({digit})"
+    return f"{round(value, -place):.0f}({digit * 10**place})" if place > 0 else f"{value:.{-place}f}({digit})"
 
 
 def concise_strings(

@@ -21,7 +21,7 @@ from ..compilation.components import over_lanes
 from ..compilation.tracing import in_cells
 from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
-from ..integration import AbstractProblem, Jumps, Lanes, States
+from ..integration import AbstractProblem, Components, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from ..runs.event import UNMEASURED
 from .form import Form, OfRun, State
@@ -95,7 +95,7 @@ class ModeProblem(AbstractProblem):
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 
-    def field(self, time: Lanes, state: States) -> States:
+    def field(self, time: Lanes, state: Components) -> States:
         rates_of = _rates_out_of_line if self.form.traits.large[self.mode] else _rates
         rates = rates_of(self.form, self.mode, self.numbers, tuple(state))
         clock = (jnp.ones_like(state[0]),) if self.form.traits.depends_on_time else ()

@@ -109,7 +109,7 @@ class Viewable(abc.ABC):
     def animate(
         self,
         path: str | os.PathLike[str],
-        times: Float[ArrayLike, " frames"] | None = None,
+        times: Float[ArrayLike, " frames"] | Sequence[float] | None = None,
         others: Sequence[Any] = (),
         overlaid: bool = False,
         speed: float | None = None,

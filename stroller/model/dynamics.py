@@ -104,7 +104,7 @@ class Dynamics(eqx.Module):
     side: float = eqx.field(static=True)
     absolute: float | None = eqx.field(static=True)
 
-    def unpack(self, state: State) -> tuple[Vector, Vector, State]:
+    def unpack(self, state: State) -> tuple[Vector, Vector, Float[Array, "others ..."]]:
         """Position, heading and the other components of a state."""
         place, heading_end = self.surface.axes, self.surface.axes + self.heading.axes(self.surface)
         return padded(state[:place]), padded(state[place:heading_end]), state[heading_end:]
@@ -334,6 +334,6 @@ class Dynamics(eqx.Module):
         return dot(missing_force, g.left) / square - front * (g.cosine + g.sine * tilt / square), front
 
 
-def padded(components: State) -> Vector:
+def padded(components: State | list[Array]) -> Vector:
     """A vector made from its components; missing components at the end vanish identically."""
     return (*components, None, None)[:3]

@@ -42,7 +42,7 @@ RIGHT_ANGLE = 1e-9
 
 
 #: A condition, in JAX for traced numbers.
-Condition: TypeAlias = Bool[Array | np.ndarray, "..."] | bool
+Condition: TypeAlias = Bool[Array | np.ndarray, "..."] | np.bool_ | bool
 
 
 def require_word(word: object, name: str, words: Iterable[str]) -> None:

@@ -25,7 +25,7 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.parameters import as_one
 from nonholonomic.text import shown
-from nonholonomic.validation import IN_DEGREES, Bound, Bounded, as_number, largest
+from nonholonomic.validation import IN_DEGREES, Bound, Bounded, Converted, as_number, largest
 
 
 def as_numbers(value: Any) -> Any:
@@ -351,7 +351,7 @@ def as_launch(value: Any) -> Any:
 USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
 
 
-def as_place(value: Any) -> tuple[Array, ...]:
+def as_place(value: Any) -> tuple[Converted, ...]:
     """Two or three numbers as a tuple of arrays; raises `ValueError` for anything else."""
     numbers = as_numbers(value)
     if not (isinstance(numbers, tuple) and len(numbers) in (2, 3)):

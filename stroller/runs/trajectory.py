@@ -461,7 +461,7 @@ class Trajectory(AbstractRun):
         side = f"; the front wheel carries no load, and a side force of up to {force:.3g} N" if force > 0.0 else ""
         return f"needs a friction coefficient of {text}{remark}{side}"
 
-    def at(self, times: Float[ArrayLike, " times"]) -> "Trajectory":
+    def at(self, times: ArrayLike | Sequence[float]) -> "Trajectory":
         """The same ride at other times, as accurate as the integration.
 
         **Arguments:** `times`: increasing, within [0, the end of the ride] [s]; or one time, for a ride of one time.
@@ -594,7 +594,7 @@ read_off_compiled: Callable[..., Trajectory] = eqx.filter_jit(read_off)
 def ride(
     model: Any,
     t1: ArrayLike,
-    times: ArrayLike | None,
+    times: ArrayLike | Sequence[float] | None,
     tolerance: ArrayLike,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,

@@ -56,7 +56,7 @@ def simulate(
     launch: Launch,
     t1: Float[ArrayLike, ""],
     input: Input | None = None,
-    times: Float[ArrayLike, " times"] | None = None,
+    times: Float[ArrayLike, " times"] | Sequence[float] | None = None,
     tolerance: float | Float[Array, ""] = 1e-9,
     solver: diffrax.AbstractSolver | None = None,
     max_steps: int = 65536,
@@ -311,9 +311,10 @@ class Recording(AbstractRecording):
     jumps: Sequence[float] | Array | None = None
     quantities: ClassVar[Quantities] = QUANTITIES
 
-    def model(self, scene: Scene) -> AbstractModel:
+    def model(self, scene: object) -> AbstractModel:
         """The model of the recorded ride, checked."""
         require_kind(scene, "data: the scene of a stroller.Recording", Scene)
+        assert isinstance(scene, Scene)
         scene.check(self.launch)
         return RideModel.of(scene, self.launch, self.input, None, self.jumps)
 

@@ -30,7 +30,7 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
 )
-from nonholonomic.integration import States
+from nonholonomic.integration import Components, States
 from nonholonomic.integration.problem import Status
 
 from ..friction import AbstractFriction, ContactLoad, Slip, length
@@ -58,7 +58,7 @@ class Parts(NamedTuple):
     place: tuple[Component, ...]
 
 
-def parts(state: States) -> Parts:
+def parts(state: Components) -> Parts:
     """Split a state into its parts."""
     u1, u2, e1, e2, e3, L1, L2, L3, *place = (state[k] for k in range(len(state)))
     return Parts((u1, u2), (e1, e2, e3), (L1, L2, L3), tuple(place))
@@ -147,7 +147,7 @@ class AbstractDynamics(eqx.Module):
         """Weight of the body [N]."""
 
     @abc.abstractmethod
-    def motion(self, state: States) -> Any:
+    def motion(self, state: Components) -> Any:
         """Evaluate the equations of motion.
 
         **Arguments:** `state`: velocity, axis and angular momentum, and the place, as above.
@@ -159,7 +159,7 @@ class AbstractDynamics(eqx.Module):
     def margins(self, state: States) -> tuple[Float[Array, "..."], ...]:
         """The smooth functions whose least value is the contact margin."""
 
-    def field(self, state: States) -> States:
+    def field(self, state: Components) -> States:
         """Rate of change of the state, (components, ...)."""
         return stacked(self.motion(state).rate, state)
 
@@ -211,11 +211,11 @@ class AbstractRollingDynamics(AbstractContactDynamics):
     """
 
     @abc.abstractmethod
-    def evaluate(self, state: States) -> tuple[Motion, Vector]:
+    def evaluate(self, state: Components) -> tuple[Motion, Vector]:
         """The motion, whose `friction` is the force along the arena per unit normal force; and the force of the arena on
         the body [N] in the moving frame: the components along the arena, and the normal force."""
 
-    def motion(self, state: States) -> Motion:
+    def motion(self, state: Components) -> Motion:
         return self.evaluate(state)[0]
 
     def grip(self, state: States, mu: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -285,7 +285,7 @@ class Dynamics(AbstractContactDynamics):
         frame = self.frame
         return None if isinstance(frame, PlaneFrame) and frame.slope is None else super().unloaded(state, scales)
 
-    def motion(self, state: States) -> Motion:
+    def motion(self, state: Components) -> Motion:
         """Evaluate the equations of motion, solving for the normal force with friction included.
 
         **Arguments:**
@@ -376,7 +376,7 @@ class RollingDynamics(AbstractRollingDynamics):
         u = cross(self.body.meridian.contact(e), angular_velocity(self.body, e, L))
         return joined(u[:2], e, L, place)
 
-    def evaluate(self, state: States) -> tuple[Motion, Vector]:
+    def evaluate(self, state: Components) -> tuple[Motion, Vector]:
         """The motion and the reaction F.
 
         (J + m (r^2 - r r^T)) w' = -w x L + m r x (r' x w) + m g r x z, with r' = a e' - R n'; then u' = r' x w + r x w',

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from nonholonomic.compilation.components import TooLarge, by_components
 from nonholonomic.compilation.tracing import with_own_numbers
@@ -39,9 +39,9 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
 )
-from nonholonomic.integration import States
+from nonholonomic.integration import Components, States
 from nonholonomic.text import shown
-from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import UNTRACEABLE, ArrayOrList, Bound, Bounded, as_number, is_traced
 
 from ..friction import AbstractFriction, ContactLoad, Slip
 from .dynamics import (
@@ -109,7 +109,7 @@ class Inertia(Bounded):
     yz: Float[Array, "..."] = eqx.field(converter=as_number)
 
     @classmethod
-    def of(cls, matrix: "ArrayLike | Inertia") -> "Inertia":
+    def of(cls, matrix: "ArrayOrList | Inertia") -> "Inertia":
         """The tensor from a symmetric matrix (3, 3); for a traced matrix, its symmetric part."""
         if isinstance(matrix, Inertia):
             return matrix
@@ -539,7 +539,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.body.mass * self.gravity
 
-    def attitude(self, state: States) -> Attitude:
+    def attitude(self, state: Components) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
         _, e, L, place = parts(state)
         c = tuple(place[-3:])
@@ -595,7 +595,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
 
     def carried_rates(
         self,
-        state: States,
+        state: Components,
         attitude: Attitude,
         contact: ContactMotion,
         push: Tangent,
@@ -629,7 +629,7 @@ class RigidSlipping(AbstractRigidDynamics):
     friction: AbstractFriction
     per_mass: Float[Array, "..."]
 
-    def motion(self, state: States) -> Motion:
+    def motion(self, state: Components) -> Motion:
         """Evaluate the equations of motion, solving for the normal force with friction included.
 
         With q = r x n and J the inertia, all in the body's axes, the centre of mass rises at u.n = -w.q. Its second rate gives
@@ -666,7 +666,7 @@ class RigidSlipping(AbstractRigidDynamics):
 class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
     """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself."""
 
-    def evaluate(self, state: States) -> tuple[Motion, Vector]:
+    def evaluate(self, state: Components) -> tuple[Motion, Vector]:
         """The motion and the reaction F in the frame.
 
         In the body's axes, with the velocity r x w of the centre of mass and r' the rate of r as a vector,

@@ -29,7 +29,7 @@ from nonholonomic.geometry import (
     sum_vectors,
 )
 from nonholonomic.geometry.surface import as_surface
-from nonholonomic.integration import States
+from nonholonomic.integration import Components, States
 from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import likely_fix, shown, suspected_gravity
 from nonholonomic.validation import Bound, Bounded, as_number, explaining, largest, require, require_all, require_kind
@@ -468,7 +468,7 @@ class Scene(Bounded, Generic[Body]):
         x_axis = (one, one, tilt) if isinstance(self.body, AbstractRigidBody) else ()
         return joined(velocities, (tilt, tilt, one), momenta, place, x_axis)
 
-    def field(self, state: States) -> States:
+    def field(self, state: Components) -> States:
         """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""
         return self.dynamics.field(state)
 

@@ -21,7 +21,7 @@ from numpy.polynomial import Polynomial, legendre
 
 from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import AbstractFrame
-from nonholonomic.integration import States
+from nonholonomic.integration import Components, States
 
 from ..friction import Frictionless, Slip, length
 from .dynamics import FITS, AbstractContactDynamics, Dynamics, Motion, RollingDynamics
@@ -320,7 +320,7 @@ class StickSlip(AbstractContactDynamics):
         """The speed sqrt(g R) [m/s]."""
         return jnp.sqrt(self.slipping.gravity * self.rolling.body.size)
 
-    def motion(self, state: States) -> Motion:
+    def motion(self, state: Components) -> Motion:
         """Evaluate the equations of motion for the state's kind of motion.
 
         **Arguments:**
@@ -337,7 +337,7 @@ class StickSlip(AbstractContactDynamics):
         """How a contact with zero margin has ended: a code in `LOSSES`. Only a slipping contact can jam."""
         return self.slipping.loss(state)
 
-    def slip_speed(self, state: States) -> Float[Array, "..."]:
+    def slip_speed(self, state: Components) -> Float[Array, "..."]:
         """Speed of the contact point along the arena [m/s]."""
         slip = self.slipping.motion(state).slip
         return length(slip.x, slip.y)
@@ -389,7 +389,7 @@ class ContactMode(StickSlip):
     tolerance: Float[Array, ""]
     rolls: bool = eqx.field(static=True)
 
-    def motion(self, state: States) -> Motion:
+    def motion(self, state: Components) -> Motion:
         """The equations of motion of this kind."""
         return (self.rolling if self.rolls else self.slipping).motion(state)
 

@@ -30,7 +30,7 @@ from nonholonomic.geometry import (
     tangents,
 )
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import AbstractPassive, AbstractProblem, Lanes, States
+from nonholonomic.integration import AbstractPassive, AbstractProblem, Components, Lanes, States
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 
 from ..model.body import Top
@@ -77,7 +77,7 @@ class FlightState(NamedTuple):
     momentum: Vector
 
 
-def flight_state(state: States) -> FlightState:
+def flight_state(state: Components) -> FlightState:
     """Split a flight state into its parts."""
     return FlightState(*(tuple(state[k + i] for i in range(3)) for k in range(0, 12, 3)))
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from nonholonomic.compilation.xla_cpu import compiled_setup, least
 from nonholonomic.geometry import Component, Tangent, Vector, cross, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import AbstractBatchedMode
-from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem, Lanes, States
+from nonholonomic.integration import AbstractPassive, AbstractProblem, Components, ExtendedProblem, Lanes, States
 
 from ..model.body import Top
 from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Dynamics, parts
@@ -57,7 +57,7 @@ class InversionProblem(AbstractProblem):
     def start(self) -> tuple[States, States]:
         return self.states, self.scales
 
-    def field(self, time: Lanes, state: States) -> States:
+    def field(self, time: Lanes, state: Components) -> States:
         return self.dynamics.field(state)
 
     def event_function(self, state: States) -> Lanes:

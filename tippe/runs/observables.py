@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from nonholonomic.compilation.cache import padded
 from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
@@ -22,7 +22,7 @@ from nonholonomic.runs.model import AbstractModel, Number, model_of
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import Unit, distinguishing_labels, in_unit
-from nonholonomic.validation import is_traced, require_one_run, times_within
+from nonholonomic.validation import ArrayOrList, is_traced, require_one_run, times_within
 
 from ..friction import Frictionless
 from ..model.body import AbstractBody, Top
@@ -153,7 +153,7 @@ class AbstractTrajectory(AbstractRun):
         """The run with its last time repeated, up to a power of two, and without fields that observables do not
         need."""
         arrays = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
-        return dataclasses.replace(self, **arrays, **dict.fromkeys(self.unused, None))
+        return dataclasses.replace(self, **arrays, **(dict.fromkeys(self.unused, None) | {"stats": {}}))
 
     @property
     @abc.abstractmethod
@@ -205,9 +205,7 @@ class AbstractTrajectory(AbstractRun):
 
         times = np.asarray(self.dense.times)
         value = beyond(times)
-        if value[0] >= 0.0:
-            return 0.0
-        return float(min(all_crossings(beyond, times, value), default=np.inf))
+        return 0.0 if value[0] >= 0.0 else float(min(all_crossings(beyond, times, value), default=np.inf))
 
     @of_each_run
     def theta_rate(self) -> Float[Array, " times"]:
@@ -271,7 +269,7 @@ class AbstractTrajectory(AbstractRun):
         start = self.scene.jellett(self.start)
         return (self.jellett - start) / jnp.abs(start)
 
-    def at(self, times: Float[ArrayLike, " times"]) -> Self:
+    def at(self, times: ArrayOrList) -> Self:
         """The same run at other times, from the dense output.
 
         **Arguments:** `times`: increasing, within [0, `end_time`] [s]; or one time, for a run of one time.
@@ -386,7 +384,7 @@ BALANCED = 1e4
 Run = TypeVar("Run", bound=AbstractTrajectory)
 
 
-def allowance(scene: Scene, energy: Values, tolerance: Number) -> Values:
+def allowance(scene: Scene, energy: Number, tolerance: Number) -> Number:
     """The allowed error [J] of an energy of the given size [J] at a tolerance."""
     return BALANCED * tolerance * (abs(energy) + scene.body.mass * scene.gravity * scene.body.size)
 

@@ -27,7 +27,7 @@ from nonholonomic.integration.problem import (
 from nonholonomic.runs.model import Number
 from nonholonomic.runs.simulate import sampled_if_legal
 from nonholonomic.text import shown
-from nonholonomic.validation import as_number, is_traced, nan_unless
+from nonholonomic.validation import ArrayOrList, as_number, is_traced, nan_unless
 
 from ..friction import length
 from ..model.dynamics import Motion, parts
@@ -400,7 +400,7 @@ class ArenaTrajectory(HybridTrajectory):
 def simulate_launch(
     model: Any,
     t1: ArrayLike,
-    times: ArrayLike | None,
+    times: ArrayOrList | None,
     tolerance: ArrayLike,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -460,9 +460,11 @@ def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> A
     mode, counts = (path.numbers(times), path.counts) if isinstance(path, HybridPath) else (None, ())
     end = path.end_time if isinstance(path, HybridPath) and scene.contact == "hybrid" else on_device(times[-1])[0]
     status, start = _status(model, path, tolerance), scene.state(model.launch)
-    run = kind(None, scene, None, None, None, None, status, end, dense=path, start=start, launch=model.launch)
+    rows = np.asarray(path.states)
+    # The states and what else has a value for each time come next.
+    run = kind(times, scene, rows, rows, times, times, status, end, dense=path, start=start, launch=model.launch)
     # NumPy slices the states, because JAX would compile each slice again for every number of steps.
-    run = run.with_rows(times, np.asarray(path.states), mode)
+    run = run.with_rows(times, rows, mode)
     counted = {name: int(count) for name, count in zip(model.counters, counts, strict=True) if name == "sticks"}
     if scene.contact == "hybrid":
         assert isinstance(path, HybridPath)

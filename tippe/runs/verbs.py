@@ -440,7 +440,7 @@ def inversion_time(
     tolerance: float = 1e-9,
     crossing: str = "first",
     solver: diffrax.AbstractERK | None = None,
-) -> Float[Array, ""]:
+) -> Float[Array, ""] | float:
     """Time at which the top has turned over; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
     The derivative comes from the implicit function theorem at the event; it is 0 if the result is infinite. Together
@@ -495,7 +495,7 @@ def reversal_time(
     t1: float | Float[Array, ""],
     tolerance: float | Float[Array, ""] = 1e-9,
     solver: diffrax.AbstractERK | None = None,
-) -> Float[Array, ""]:
+) -> Float[Array, ""] | float:
     """Time at which the spin about the arena's normal first vanishes; works under `jit`, `vmap`, `grad`, `jvp` and their
     compositions.
 
@@ -535,7 +535,7 @@ def reversal_time(
     return first_or_last_time(TopModel.timed(scene, launch, None), t1, "first", settings_for_lanes(tolerance, solver))
 
 
-def first_or_last_time(model: TopModel, t1: Number, crossing: str, settings: Settings) -> Float[Array, ""]:
+def first_or_last_time(model: TopModel, t1: Number, crossing: str, settings: Settings) -> Float[Array, ""] | float:
     """The time of the event of a launch. **Arguments:** as for `inversion_time`, checked.
 
     **Raises:** `ValueError` for a run that needed too many steps. A warning states any other failure.
