@@ -99,8 +99,8 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: obj
         precession = math.sqrt(mass * float(scene.gravity) * a / (I3 * (a / R - end) + I1 * end))
         slowest = R * (I1 * (1.0 - end**2) + I3 * (end - a / R) ** 2) * precession / (I3 * (R * start - a))
         if fastest < slowest < 2.0 * math.pi * fastest:
-            advice = f"was it in turns a second? {fastest:g} turns a second are {2.0 * math.pi * fastest:.4g} rad/s"
-            warn(f"spin = {fastest:g} rad/s is slow: this top needs about {slowest:.3g} rad/s to turn over; {advice}")
+            advice = f"was it in turns a second? {fastest:.4g} turns a second are {2.0 * math.pi * fastest:.4g} rad/s"
+            warn(f"spin = {fastest:.4g} rad/s is slow: this top needs about {slowest:.3g} rad/s to turn over; {advice}")
 
 
 def check_smooth(scene: Scene, caller: str) -> None:
