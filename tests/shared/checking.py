@@ -16,6 +16,9 @@ from beartype.vale import IsInstance
 PACKAGES = ("nonholonomic", "tippe", "stroller")
 TESTS = str(Path(__file__).parents[1])
 
+#: Functions of the packages that pass the arguments of their callers on.
+DECORATORS = ("explaining.<locals>.explained",)
+
 #: The tests that have passed an illegal argument, as `PYTEST_CURRENT_TEST` names them.
 lenient_tests: set[str | None] = set()
 
@@ -46,11 +49,12 @@ def check(function: Callable) -> Callable:
 
 def is_called_by_test(frame: FrameType | None) -> bool:
     """Whether a call comes from a test, perhaps through other libraries, and not from the packages themselves."""
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] not in PACKAGES:
-        if frame.f_code.co_filename.startswith(TESTS):
-            return True
+    while frame is not None and not frame.f_code.co_filename.startswith(TESTS):
+        is_package = frame.f_globals.get("__name__", "").partition(".")[0] in PACKAGES
+        if is_package and frame.f_code.co_qualname not in DECORATORS:
+            return False
         frame = frame.f_back
-    return False
+    return frame is not None
 
 
 def readable(hint: object) -> object:
