@@ -13,6 +13,7 @@ from nonholonomic.geometry import AbstractSurface, cross, difference, dot, scale
 from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
 from nonholonomic.validation import require_flag, require_kind, require_whole
+from nonholonomic.views.stage import fixed
 
 from ..model.dynamics import padded
 from ..model.input import Motion
@@ -143,11 +144,10 @@ def plan(
         if not best.reached:
             best = checked_drive(problem, best.input, TIGHT, CONFIRMED)
             best = dataclasses.replace(best, hindrances=(*best.hindrances, *reasons[:1]))
-    positions = np.moveaxis(np.concatenate(tried)[:, : INTERVALS + 1, : scene.surface.axes], -1, 0)
-    lines = np.stack(
-        [np.asarray(part) for part in scene.surface.in_fixed_frame(padded(jnp.asarray(positions)))], axis=-1
-    )
-    return dataclasses.replace(best, candidates=jnp.asarray(lines))
+    knots = np.nan_to_num(np.concatenate(tried)[:, : INTERVALS + 1, : scene.surface.axes])
+    fine = np.linspace(0.0, INTERVALS, FINE * INTERVALS + 1)
+    positions = np.moveaxis(CubicSpline(np.arange(INTERVALS + 1), knots, axis=1)(fine), -1, 0)
+    return dataclasses.replace(best, candidates=jnp.asarray(fixed(scene.surface, padded(jnp.asarray(positions)))))
 
 
 def _guesses(

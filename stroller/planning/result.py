@@ -10,15 +10,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.geometry import AbstractSurface
+from nonholonomic.geometry import AbstractSurface, Plane, cross, scale
 from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit
 from nonholonomic.validation import require_file, require_package
 from nonholonomic.views import DARK, Body, Mesh, Page, Stage, arena, bar, page
 from nonholonomic.views.plot import new_figure
-from nonholonomic.views.stage import curves_in, of_grid
+from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
-from ..model.dynamics import Dynamics
+from ..model.dynamics import Dynamics, padded
 from ..runs.trajectory import Trajectory
 from ..runs.verbs import simulate
 from .problem import Box, Disc, Footprint, Limits, Points, Problem, seen_from_above
@@ -39,6 +39,9 @@ SIDES, OUTLINES = 48, 13
 #: Colours of obstacles, of candidates, and of the goal.
 STONE, FAINT, GREEN = 0x8A8F98, 0x5B8DB8, 0x1F8A4C
 
+#: The corners of a footprint, and the first one again.
+CLOSED = [0, 1, 2, 3, 0]
+
 #: The identity as a quaternion (x, y, z, w).
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
@@ -56,7 +59,7 @@ class Plan(eqx.Module):
     - `errors`: errors of place [m], heading [rad] and speed [m/s] at the end;
     - `hindrances`: what is wrong with the run, in words; empty if the goal is reached;
     - `excess`: the same as a number, 0 if the goal is reached, by which attempts are compared;
-    - `candidates`: the paths [m] of all optimised candidates, (candidates, knots, 3), in the fixed frame.
+    - `candidates`: the paths [m] of all optimised candidates, (candidates, points, 3), in the fixed frame.
 
     `print` shows the result, `plot` draws it, and `view` writes a page on which it is played.
 
@@ -117,8 +120,8 @@ class Plan(eqx.Module):
         return str(self)
 
     def plot(self, unit: str | Sequence[str] | None = None) -> Any:
-        """Draw the plan from above, with its obstacles, footprint and candidates, and its speed and steering over time
-        (needs matplotlib).
+        """Draw the plan from above, or in space on a curved ground: its goal, obstacles, footprint and candidates; and its
+        speed and steering over time (needs matplotlib).
 
         **Arguments:** `unit`: unit of speed and steering, such as "deg", "km/h", or both.
 
@@ -128,25 +131,29 @@ class Plan(eqx.Module):
         """
         require_package("matplotlib", "plot", "plot")
         require_unit(unit)
-        figure = new_figure(9.0, 4.5)
-        above, curves = figure.subplots(1, 2, width_ratios=(3, 2))
-        for obstacle in self.problem.obstacles:
-            above.fill(*outline(obstacle).T, color="0.6")
+        problem, surface, figure = self.problem, self.problem.scene.surface, new_figure(9.0, 4.5)
+        grid, axes = figure.add_gridspec(1, 2, width_ratios=(3, 2)), 2 if isinstance(surface, Plane) else 3
+        above = figure.add_subplot(grid[0], **({"projection": "3d", "elev": 60.0} if axes == 3 else {}))
+        curves = figure.add_subplot(grid[1])
+
+        def draw(points: Points, colour: str, width: float, label: str | None = None, marker: str = "") -> None:
+            above.plot(*np.asarray(points).T[:axes], marker, color=colour, linewidth=width, label=label)
+
+        for line in planned_stage(self).arena.lines if axes == 3 else ():
+            draw(line, "0.7", 0.4)
+        for foot in (outline(surface, obstacle) for obstacle in problem.obstacles):
+            above.fill(*foot.T[:2], color="0.6") if axes == 2 else draw(foot[[*range(len(foot)), 0]], "0.4", 1.5)
         for line in self.candidates:
-            above.plot(line[:, 0], line[:, 1], color="0.75", linewidth=0.7)
-        problem = self.problem
-        if problem.is_flat:
-            corners = np.asarray(corners_of(problem.scene.dynamics, problem.footprint, self.run.state))
-            for number in np.linspace(0, len(corners) - 1, OUTLINES).astype(int):
-                above.plot(*np.concatenate([corners[number], corners[number][:1]]).T, color="C0", linewidth=0.6)
-        path = np.asarray(self.run.place if problem.is_flat else self.run.position)
-        above.plot(path[:, 0], path[:, 1], color="C0", label="rear axle")
-        if problem.is_flat and problem.goal.heading is None:
-            above.plot(*np.asarray(problem.goal_pose[:2])[:, None], "x", color="C2", label="goal")
-        elif problem.is_flat:
-            target = problem.corners(problem.goal_pose)
-            above.plot(*np.concatenate([target, target[:1]]).T, color="C2", linewidth=1.2, label="goal")
-        above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+            draw(line, "0.75", 0.7)
+        shown = np.linspace(0, len(self.run.t) - 1, OUTLINES).astype(int)
+        for corners in outlines(problem, problem.footprint, self.run.state[shown, : 2 * surface.axes]):
+            draw(corners[CLOSED], "C0", 0.6)
+        draw(self.run.position, "C0", 1.5, "rear axle")
+        is_cross, target = problem.goal.heading is None, goal_corners(problem)
+        draw(target.mean(axis=0)[None] if is_cross else target[CLOSED], "C2", 1.2, "goal", "x" if is_cross else "")
+        above.grid(False)
+        above.locator_params(nbins=5)
+        above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", **({"zticks": []} if axes == 3 else {}))
         above.set_title("reaches the goal" if self.reached else "; ".join(self.hindrances), fontsize="small")
         above.legend(fontsize="small")
         for name, values, si in (("speed", self.run.speed, "m/s"), ("steering angle", self.run.steering, "rad")):
@@ -275,13 +282,13 @@ def inputs_of(
 # The parts of pictures.
 
 
-def outline(obstacle: Box | Disc) -> Float[np.ndarray, "corners 2"]:
-    """The outline of an obstacle [m]."""
-    if isinstance(obstacle, Box):
-        return obstacle.corners
+def outline(surface: AbstractSurface, obstacle: Box | Disc) -> Float[np.ndarray, "corners 3"]:
+    """The outline of an obstacle on the ground [m], in the fixed frame."""
     angle = 2.0 * np.pi * np.arange(SIDES) / SIDES
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return np.array(obstacle.centre, dtype=float) + float(obstacle.radius) * unit
+    is_box = isinstance(obstacle, Box)
+    corners = obstacle.corners if is_box else np.array(obstacle.centre) + float(obstacle.radius) * unit
+    return fixed(surface, surface.chart((corners[:, 0], corners[:, 1]))[0])
 
 
 def planned_stage(plan: Plan) -> Stage:
@@ -289,14 +296,15 @@ def planned_stage(plan: Plan) -> Stage:
     (stage,) = plan.run.stages()
     problem, (show, *_) = plan.problem, stage.shows
     surface, length, count = problem.scene.surface, float(problem.scene.body.wheelbase), len(show.times)
-    feet = [on_ground(surface, outline(part)) for part in problem.obstacles]
+    feet = [outline(surface, part) for part in problem.obstacles]
     points = np.concatenate([np.asarray(plan.run.position), *feet])
     ground = arena(surface, points, stage.arena.normal, 3.0 * length, length)
     still = [("candidates", [ribbon(line, RAISED * length, THIN * length) for line in plan.candidates])]
     if feet:
         still.append(("obstacles", [prism(foot, HEIGHT * length) for foot in feet]))
-    if problem.is_flat:
-        still.append(("goal", [goal_mark(problem, 2.0 * RAISED * length, 2.0 * THIN * length)]))
+    ends = goal_corners(problem, 2.0 * RAISED * length)
+    pairs = (ends[:2], ends[2:]) if problem.goal.heading is None else (ends, np.roll(ends, -1, axis=0))
+    still.append(("goal", [bars(*pairs, 2.0 * THIN * length, GREEN)]))
     place, turn = np.zeros((count, 3)), np.tile(UNTURNED, (count, 1))
     bodies = tuple(Body(name, place, turn, tuple(meshes)) for name, meshes in still)
     vehicle = show.bodies[0]
@@ -311,24 +319,23 @@ def planned_stage(plan: Plan) -> Stage:
     return stage._replace(title=title, arena=ground, shows=shows, rise=RISE)
 
 
-def goal_mark(problem: Problem, raised: float, radius: float) -> Mesh:
-    """The outline of the footprint at the goal, or a cross at a goal without a heading."""
-    surface, place = problem.scene.surface, np.asarray(problem.goal_pose[:2])
-    if problem.goal.heading is not None:
-        corners = on_ground(surface, problem.corners(problem.goal_pose), raised)
-        return bars(corners, np.roll(corners, -1, axis=0), radius, GREEN)
-    arm = CROSS * float(problem.scene.body.wheelbase)
-    ends = on_ground(surface, place + arm * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]), raised)
-    return bars(ends[:2], ends[2:], radius, GREEN)
+def goal_corners(problem: Problem, raised: float = 0.0) -> Float[np.ndarray, "4 3"]:
+    """The corners [m] of the footprint at the goal, or the ends of a cross at a goal without a heading."""
+    arm = CROSS * problem.scene.body.wheelbase
+    footprint = Footprint(2.0 * arm, 2.0 * arm, arm) if problem.goal.heading is None else problem.footprint
+    return outlines(problem, footprint, problem.goal_pose[None], raised)[0]
 
 
-def on_ground(
-    surface: AbstractSurface, points: Float[np.ndarray, "points 2"], raised: float = 0.0
-) -> Float[np.ndarray, "points 3"]:
-    """Points of x and y on the ground, or above it, in the fixed frame."""
-    position = surface.chart((points[:, 0], points[:, 1]))[0]
-    columns = [np.broadcast_to(part, len(points)) for part in surface.in_fixed_frame(position)]
-    return np.stack(columns, axis=-1) + np.array([0.0, 0.0, raised])
+def outlines(
+    problem: Problem, footprint: Footprint, poses: Float[Array, "poses components"], raised: float = 0.0
+) -> Float[np.ndarray, "poses 4 3"]:
+    """The corners [m] of a footprint on the ground, or above it, in the fixed frame."""
+    dynamics, surface = problem.scene.dynamics, problem.scene.surface
+    place, heading = padded(poses.T[: surface.axes]), padded(poses.T[surface.axes :])
+    left = scale(dynamics.side, cross(surface.normal(place), heading))
+    flat = footprint.corners(*(fixed(surface, part) for part in (place, heading, left)))
+    ground = surface.nearest(own(surface, np.moveaxis(np.asarray(flat), -1, 0)))
+    return fixed(surface, ground) + raised * dynamics.side * fixed(surface, surface.normal(ground))
 
 
 def prism(foot: Float[np.ndarray, "corners 3"], height: float) -> Mesh:

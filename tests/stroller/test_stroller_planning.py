@@ -172,6 +172,36 @@ def test_a_goal_without_a_heading_is_drawn_as_a_cross(parked):
     assert_close(np.ptp(vertices[:, :2], axis=0), 0.05, atol=0.01)
 
 
+@pytest.mark.parametrize("heading", [0.4, None])
+def test_a_plan_on_a_curved_ground_is_drawn_in_space(parked, heading):
+    """With the ground, the vehicle, and the goal, which lie on the ground."""
+    scene, launch = stroller.presets.bowl(), stroller.Launch((0.0, -1.0), 0.3, 0.5)
+    run, length = stroller.simulate(scene, launch, 1.0), float(scene.body.wheelbase)
+    problem = checked_problem(scene, launch, stroller.Goal((0.3, -0.9), heading), 1.0)
+    plan = dataclasses.replace(parked[2], run=run, problem=problem, candidates=np.asarray(run.position)[None])
+    above = plan.plot().axes[0]
+    assert above.name == "3d"
+    lines = {line.get_label(): np.array(line.get_data_3d()).T for line in above.lines}
+    assert_close(lines["rear axle"], run.position)
+    # A line for each number of the ground's grid, the candidate, the outlines of the vehicle, the path and the goal.
+    assert len(above.lines) > 13 + 3 + 5
+    goal = lines["goal"]
+    assert len(goal) == (1 if heading is None else 5)
+    assert_close(scene.surface.offset(tuple(goal.T)), np.zeros(len(goal)), atol=1e-2 * length)
+    if heading is not None:
+        assert_close(np.linalg.norm(goal[0] - goal[3]), 1.4 * length, rtol=0.02)
+    (body,) = [body for show in planned_stage(plan).shows for body in show.bodies if body.name == "goal"]
+    assert np.linalg.norm(body.meshes[0].vertices - goal.mean(axis=0), axis=1).max() < 1.2 * length
+
+
+def test_candidates_are_smooth_curves(parked):
+    """Eight points for each interval of the optimiser, on its path."""
+    _, _, plan = parked
+    line = np.asarray(plan.candidates)[-1]
+    assert len(line) == 8 * 64 + 1
+    assert_close(line[[0, -1]], np.asarray(plan.run.position)[[0, -1]], atol=0.05)
+
+
 def test_a_table_drives_a_plan_as_a_single_ride_does(parked):
     """The splines of a plan belong to a ride, whatever the number of cells: their coefficients are not one per cell."""
     launch, _, plan = parked
