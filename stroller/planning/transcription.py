@@ -190,13 +190,11 @@ class Task(eqx.Module):
         low, high = problem.limits.arrays(reserve)
         # No drive keeps a reserve that its start or its goal does not have.
         low[:2], high[:2] = np.minimum(low[:2], ends.min(axis=0)), np.maximum(high[:2], ends.max(axis=0))
-        front_speed = launch.speed / jnp.cos(launch.steering)
-        force = float(body.mass) * speed / min(1.0, 0.1 * t1)
         return cls(
             dynamics=problem.scene.dynamics,
             footprint=problem.footprint,
             obstacles=problem.obstacle_arrays,
-            start=(problem.start_pose, launch.steering, launch.steering_rate, front_speed),
+            start=(problem.start_pose, launch.steering, launch.steering_rate, launch.speed / jnp.cos(launch.steering)),
             goal=(problem.goal_pose, goal.speed),
             has_heading=jnp.asarray(0.0 if goal.heading is None else 1.0),
             low=jnp.asarray(low),
@@ -204,7 +202,7 @@ class Task(eqx.Module):
             clearance=jnp.asarray(clearance),
             length=body.wheelbase,
             speed=jnp.asarray(speed),
-            force=jnp.asarray(force),
+            force=jnp.asarray(float(body.mass) * speed / min(1.0, 0.1 * t1)),
             haste=jnp.asarray(1.0 / t1 if problem.in_haste else 0.0),
             with_grip=problem.limits.grip is not None,
         )
