@@ -5,6 +5,7 @@ import difflib
 import html
 import inspect
 import math
+import operator
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -109,15 +110,11 @@ class AbstractHeld(eqx.Module):
 
 def likely(name: object, known: Iterable[str]) -> str:
     """The known name that resembles an unknown one, as an addition to a message; empty if there is none."""
-    names = list(known)
-    anagrams = [candidate for candidate in names if sorted(candidate) == sorted(str(name))]
+    names, text = list(known), str(name)
+    anagrams = [other for other in names if sorted(other) == sorted(text)]
     # By the measure of `difflib`, a name of two letters, such as "mu", resembles no other.
-    short = [
-        other
-        for other in names
-        if len(other) == len(str(name)) == 2 and (other[0] == str(name)[0] or other[1] == str(name)[1])
-    ]
-    matches = anagrams or difflib.get_close_matches(str(name), names, 1) or short
+    short = [other for other in names if len(other) == len(text) == 2 and any(map(operator.eq, other, text))]
+    matches = anagrams or difflib.get_close_matches(text, names, 1) or short
     return f"; did you mean {matches[0]!r}?" if matches else ""
 
 
@@ -148,6 +145,11 @@ UNITS = {
     "1": {"1": 1.0, "%": 1e-2},
 }
 
+#: Other names of units.
+SYNONYMS = {"°": "deg", "degree": "deg", "degrees": "deg", "°/s": "deg/s", "radian": "rad", "radians": "rad"}
+SYNONYMS |= {"sec": "s", "second": "s", "seconds": "s", "1/min": "rpm", "rev/min": "rpm", "U/min": "rpm"}
+SYNONYMS |= {"turn": "rev", "turns": "rev", "turns/s": "rev/s", "degrees/s": "deg/s"}
+
 #: The unit of drawn numbers, such as "deg", or several for numbers of different dimensions; `None` for SI units.
 Unit: TypeAlias = str | Sequence[str] | None
 
@@ -158,6 +160,9 @@ SHOWN = 4
 #: A message shows lists of up to this many values in full.
 MOST_PARTS = 8
 
+
+#: Length of a label that leaves room for the picture.
+MOST_CHARACTERS = 30
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -195,7 +200,7 @@ def in_unit(si: str, unit: Unit) -> tuple[str, float]:
 
 def _with_rates(unit: Unit) -> list[str]:
     """The units that a user names, and then the rates that they imply."""
-    names = [unit] if isinstance(unit, str) else [*(unit or ())]
+    names = [SYNONYMS.get(name, name) for name in ([unit] if isinstance(unit, str) else unit or ())]
     return [*names, *(f"{name}/s" for name in names)]
 
 
@@ -214,9 +219,9 @@ def require_unit(unit: object) -> None:
     """Raise `ValueError` unless this is `None`, a unit that pictures can show, or a list of such units."""
     known = [name for readable, names in UNITS.items() if readable != "1" for name in names]
     names = [unit] if isinstance(unit, str) else unit
-    if unit is not None and not (isinstance(names, list | tuple) and all(name in known for name in names)):
-        hint = likely(unit, known) if isinstance(unit, str) else ""
-        raise ValueError(f"unit = {shown(unit)} must be one of {', '.join(known)}, or a list of them{hint}")
+    if unit is not None and not (isinstance(names, list | tuple) and {*known, *SYNONYMS}.issuperset(names)):
+        listed, hint = ", ".join(known), likely(unit, known)
+        raise ValueError(f"unit = {shown(unit)} must be one of {listed}, or a list of them{hint}")
 
 
 def as_text(value: object, unit: str | None = "1") -> str:
@@ -342,16 +347,18 @@ def distinguishing_labels(starts: list[tuple[str, ...]], *groups: list[Any], uni
     **Arguments:** `starts`: for each run, the same number of texts, such as its angle and its spin; `groups`: modules of
     one role, such as the scenes, one per run; `unit`: units for their numbers, as for `in_unit`.
 
-    **Returns:** the labels. If nothing differs, a label is the whole start; equal labels are numbered.
+    **Returns:** the labels, which end in "…" where more differs than `MOST_CHARACTERS` can say. If nothing differs, a label is
+    the whole start; equal labels are numbered.
     """
     differing = [k for k, texts in enumerate(zip(*starts, strict=True)) if len(set(texts)) > 1]
     parts = [[start[k] for k in differing] for start in starts]
     for group in groups:
         parts = [part + difference for part, difference in zip(parts, differences(group, unit), strict=True)]
     names = [", ".join(part or start) for part, start in zip(parts, starts, strict=True)]
-    return [
-        name if names.count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)
-    ]
+    ends = [name.rfind(", ", 0, MOST_CHARACTERS) if len(name) > MOST_CHARACTERS else len(name) for name in names]
+    names = [name[:end] + ", …" * (end < len(name)) for name, end in zip(names, ends, strict=True)]
+    count = names.count
+    return [name if count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)]
 
 
 def differences(modules: list[Any], unit: Unit = None) -> list[list[str]]:

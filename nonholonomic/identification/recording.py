@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..text import UNITS, likely, one_line, readable_unit, shown
+from ..text import SYNONYMS, UNITS, likely, one_line, readable_unit, shown
 from ..validation import as_number, as_number_or_none, as_path, require, warn
 from .likelihood import Measurements
 
@@ -262,11 +262,6 @@ DASHES = ("-", "--", "\u2013", "\u2014")
 
 #: Cells, in lower case, that stand for a missing sample.
 MISSING = ("", "nan", "n/a", "#n/a", "na", "null", "none", *DASHES)
-
-#: Other words for units in headers.
-SYNONYMS = {"°": "deg", "degree": "deg", "degrees": "deg", "°/s": "deg/s", "radian": "rad", "radians": "rad"}
-SYNONYMS |= {"sec": "s", "second": "s", "seconds": "s", "1/min": "rpm", "rev/min": "rpm", "U/min": "rpm"}
-
 
 #: What describes a column: a header with its unit, or a header (for an error, possibly a number) and a unit or factor.
 Column = object

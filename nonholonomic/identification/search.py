@@ -307,7 +307,7 @@ class Minima(NamedTuple):
         pair = self.weighed(problem, measurements), other.weighed(problem, measurements)
         order = np.argsort(np.concatenate([minima.deviance for minima in pair]), kind="stable")[: len(self.starts)]
         ends = jax.tree.map(lambda *parts: np.concatenate(parts)[order], *(minima[:4] for minima in pair))
-        return Minima(*ends, measurements)
+        return Minima._make((*ends, measurements))
 
     def with_rows(self, rows: Int[np.ndarray, " few"], later: "Minima") -> "Minima":
         """These minima, of which some rows were fitted further."""

@@ -613,9 +613,8 @@ class Tabular(abc.ABC):
             raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
         if not quantities:
             return self.overview(runs, labels, unit, ax)
-        return draw_series(
-            [run.table_of(quantities).drawn_in(unit, *quantities) for run in runs], quantities, labels, ax
-        )
+        tables = [run.table_of(quantities).drawn_in(unit, *quantities) for run in runs]
+        return draw_series(tables, quantities, labels, ax)
 
     def portrait(self, x: str | None = None, y: str | None = None, ax: Any = None, unit: Any = None) -> Any:
         """Draw one quantity against another, a phase portrait (needs matplotlib).

@@ -344,8 +344,9 @@ def draw_series(
                 colour = line.get_color()
             panel.set_ylabel(quantity)
         panel.margins(x=0.0)
-        if panel.get_legend_handles_labels()[0]:
-            panel.legend(fontsize="small")
+        if texts := panel.get_legend_handles_labels()[1]:
+            # Above the panel, where it covers no curve.
+            panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=_columns(texts), fontsize="small")
     panels[-1].set_xlabel(tables[0].label("time"))
     return figure or panels[0]
 
@@ -385,7 +386,10 @@ def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> "Figure":
     panel.set_xlabel("time [s]")
     if len(shows) > 1 or any(names):
         names = names or [show.name for show in shows]
-        # As many columns as the longest name leaves room for.
-        columns = max(1, WIDTH // (max(map(len, names)) + 6))
-        figure.legend(names, loc="outside upper center", ncols=min(columns, len(names)), fontsize="small")
+        figure.legend(names, loc="outside upper center", ncols=_columns(names), fontsize="small")
     return figure
+
+
+def _columns(names: Sequence[str]) -> int:
+    """As many columns of a legend as the longest name leaves room for."""
+    return min(len(names), max(1, WIDTH // (max(map(len, names)) + 6)))

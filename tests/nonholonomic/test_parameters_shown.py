@@ -80,9 +80,35 @@ def test_runs_are_told_apart_by_what_differs():
     assert distinguishing_labels([("a", "b")], scenes[:1]) == ["a, b"]
 
 
+def test_labels_of_runs_leave_room_for_the_picture():
+    launch = tippe.Launch(0.1, 200.0)
+    tops = [tippe.presets.wooden(), tippe.presets.cohen(), tippe.presets.rutstam()]
+    scenes = [tippe.Scene(top, friction=tippe.Viscous(0.3), contact="hybrid") for top in tops]
+    runs = [tippe.simulate(scene, launch, t1=0.01) for scene in scenes]
+    figure = runs[0].plot("theta", others=runs[1:])
+    figure.draw_without_rendering()
+    (panel,) = figure.axes
+    legend = panel.get_legend()
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert len(set(texts)) == 3
+    assert max(map(len, texts)) <= 30 + len(", …")
+    assert panel.get_position().width > 0.8
+    assert legend.get_window_extent().y0 >= panel.get_window_extent().y1
+    long = distinguishing_labels([("a" * 20, "b" * 20, "c"), ("d" * 20, "b" * 20, "e"), ("a" * 20, "b" * 20, "f")])
+    assert long == ["aaaaaaaaaaaaaaaaaaaa, c", "dddddddddddddddddddd, e", "aaaaaaaaaaaaaaaaaaaa, f"]
+    cut = distinguishing_labels([("a" * 20, "b" * 20), ("a" * 20, "c" * 20), ("d", "b" * 20)])
+    assert cut == ["aaaaaaaaaaaaaaaaaaaa, … (1)", "aaaaaaaaaaaaaaaaaaaa, … (2)", "d, bbbbbbbbbbbbbbbbbbbb"]
+
+
 def test_numbers_are_shown_in_other_units():
     assert in_unit("rad", "deg") == ("deg", pytest.approx(180.0 / np.pi))
     assert in_unit("rad s-1", "deg") == ("deg/s", pytest.approx(180.0 / np.pi))
+    body = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    tilted = [tippe.Scene(body, tippe.Plane(tilt), tippe.Viscous(0.3)) for tilt in (None, 0.1, 0.2)]
+    assert distinguishing_labels([()] * 3, tilted, unit="degrees") == ["no tilt", "tilt 5.73 deg", "tilt 11.46 deg"]
+    for name in ("degrees", "°", "degree"):
+        assert in_unit("rad", name) == in_unit("rad", "deg")
+    assert in_unit("rad s-1", "turns/s") == ("rev/s", pytest.approx(0.5 / np.pi))
     assert in_unit("rad s-1", ["deg", "rpm"]) == ("rpm", pytest.approx(30.0 / np.pi))
     assert in_unit("1/s", "ms") == ("1/s", 1.0)
     assert in_unit("1", "deg") == ("1", 1.0)

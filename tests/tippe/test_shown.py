@@ -174,7 +174,7 @@ def test_quantities_are_drawn_over_time_by_name_and_in_degrees(run):
     tilted = dataclasses.replace(slower, scene=tippe.Scene(run.scene.body, tippe.Plane(0.1), run.scene.friction))
     legend = run.plot("theta", others=[tilted], unit=("deg", "rpm")).axes[0].get_legend()
     theta, spin = np.degrees(slower.theta[0]), float(slower.spin[0]) * 30.0 / np.pi
-    assert legend.get_texts()[1].get_text().startswith(f"θ(0) = {theta:.3g} deg, {spin:.4g} rpm, tilt 5.73 deg")
+    assert legend.get_texts()[1].get_text() == f"θ(0) = {theta:.3g} deg, {spin:.4g} rpm, …"
 
 
 def test_labels_are_what_differs(run):
@@ -202,7 +202,7 @@ def test_plots_that_cannot_be_drawn_are_refused(run):
         (("tehta",), {}, "quantity = 'tehta' must be one of theta, .*did you mean 'theta'"),
         (("theta",), {"unit": "mm"}, r"unit = 'mm' fits nothing that is drawn: theta \[rad\], time \[s\]"),
         ((), {"unit": "%"}, "unit = '%' must be one of"),
-        (("theta",), {"unit": "degree"}, "unit = 'degree' must be one of s, ms, .*did you mean 'deg'"),
+        (("theta",), {"unit": "dge"}, "unit = 'dge' must be one of s, ms, .*did you mean 'deg'"),
         (("theta", "spin"), {"ax": object()}, "ax takes one quantity, not 2: theta, spin"),
         ((), {"ax": object()}, "ax takes one quantity: name it"),
         ((run,), {}, r"others = a run must be a list of runs: write others=\[run\]"),

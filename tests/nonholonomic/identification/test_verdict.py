@@ -191,8 +191,8 @@ def test_a_picture_has_limits_at_its_edge_and_other_units():
     assert profile.get_xlabel() == "x [deg]"
     assert_close(profile.lines[0].get_xdata()[0], math.degrees(fit.interval("x", 3.0)[0]))
     assert [tick.get_text() for tick in residuals.get_xticklabels()] == ["#1", "#2", "#3", "#4", "#5"]
-    with pytest.raises(ValueError, match="unit = 'degree' must be one of"):
-        fit.plot(unit="degree")
+    with pytest.raises(ValueError, match="unit = 'grade' must be one of"):
+        fit.plot(unit="grade")
 
 
 def test_a_report_and_a_picture_tell_the_estimate_from_the_most_likely_values():

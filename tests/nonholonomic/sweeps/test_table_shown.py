@@ -148,7 +148,7 @@ def test_it_draws_in_given_axes_and_shows_itself(table):
         ({"x": "tehta"}, "x = 'tehta' must be one of theta, mu, spin; did you mean 'theta'"),
         ({"x": "mu", "y": "mu"}, "x = 'mu' must not be named in at, nor be both x and y"),
         ({"x": "mu", "at": {"mu": 0.1}}, "x = 'mu' must not be named in at"),
-        ({"unit": "degrees"}, "unit = 'degrees' must be one of"),
+        ({"unit": "grades"}, "unit = 'grades' must be one of"),
         ({"variable": "status"}, "variable = 'status' must be a numeric variable"),
     ],
 )

@@ -142,7 +142,7 @@ def test_labels_name_each_number_once_and_briefly():
     assert labels(both, run((0.8, 3.0), (0.8, 3.0))) == ["gravity 9", "gravity 3"]
     assert labels(both, run((0.8, 3.0), (0.8, 9.0))) == ["system.modes[0].gravity 9", "system.modes[0].gravity 3"]
     different = labels(both, run((0.8, 3.0), (0.8, 2.0), start=[2.0, 0.0, 0.0]))
-    assert different[1] == "start[0] 2, system.modes[0].gravity 3, system.modes[1].gravity 2"
+    assert different[1] == "start[0] 2, …"
     assert labels(run((0.8, 9.0)), run((0.8, 3.0))) == ["gravity 9", "gravity 3"]
 
 

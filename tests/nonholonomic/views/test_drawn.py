@@ -223,8 +223,8 @@ def test_a_view_has_the_unit_that_was_asked_for(tmp_path, monkeypatch):
     assert re.search(r'"label": "z \[cm\]", "values": \[\d+, \d+\], "factor": 100\.0', run.view(unit="cm").html)
     with pytest.raises(ValueError, match=r"unit = 'deg' fits nothing that is drawn: x \[m\], z \[m\]"):
         run.view(unit="deg")
-    with pytest.raises(ValueError, match="unit = 'degree' must be one of"):
-        run.animate(tmp_path / "ball.webm", unit="degree")
+    with pytest.raises(ValueError, match="unit = 'grade' must be one of"):
+        run.animate(tmp_path / "ball.webm", unit="grade")
 
 
 def test_the_front_of_an_arena_is_towards_the_room():
