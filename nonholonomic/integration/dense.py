@@ -207,6 +207,9 @@ PIECE = 2048
 #: 7 ms and 0.4 MB.
 PIECE_OF_MODE = 128
 
+#: Length [s] of the first step that is tried, as by Diffrax.
+FIRST_STEP = 0.01
+
 #: Number of parts of every step at whose ends the domain margin is checked.
 PARTS = 8
 
@@ -267,10 +270,8 @@ def _start(
     where JAX would compile each of their operations."""
     state, scales = map(jnp.asarray, problem.start())
     margin = problem.margin_at_start(t0, state)
-    solver = settings.for_single_runs if dense or margin is not None else settings.for_steps_alone
-    field, control = _field(problem, t0, state), _control(problem, settings, state, scales)
-    end, _ = control.init(field, t0, t1, state, None, problem, solver.func, solver.error_order(field))
-    return state, scales, margin, jnp.asarray(end) - t0
+    # The first step that Diffrax tries, and shortens.
+    return state, scales, margin, jnp.full((), FIRST_STEP)
 
 
 def _field(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array, " components"]) -> diffrax.ODETerm:
