@@ -207,7 +207,7 @@ PIECE = 2048
 #: 7 ms and 0.4 MB.
 PIECE_OF_MODE = 128
 
-#: Length [s] of the first step that is tried, as by Diffrax.
+#: Length [s] of the first step that is tried, and shortened where it is too long; Diffrax 0.7 begins with the same.
 FIRST_STEP = 0.01
 
 #: Number of parts of every step at whose ends the domain margin is checked.
@@ -264,14 +264,11 @@ def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array,
 
 @eqx.filter_jit
 def _start(
-    problem: AbstractProblem, t0: Float[Array, ""], t1: Float[Array, ""], settings: Settings, dense: bool
-) -> tuple[Float[Array, " components"], Float[Array, " components"], Float[Array, ""] | None, Float[Array, ""]]:
-    """State, scales and domain margin at the start, and the length of the first step [s] that Diffrax selects: one program,
-    where JAX would compile each of their operations."""
-    state, scales = map(jnp.asarray, problem.start())
-    margin = problem.margin_at_start(t0, state)
-    # The first step that Diffrax tries, and shortens.
-    return state, scales, margin, jnp.full((), FIRST_STEP)
+    problem: AbstractProblem, time: Float[Array, ""]
+) -> tuple[Float[Array, " components"], Float[Array, " components"], Float[Array, ""] | None]:
+    """State, scales and domain margin at the start: one program, where JAX would compile each of their operations."""
+    state, scales = problem.start()
+    return jnp.asarray(state), jnp.asarray(scales), problem.margin_at_start(time, state)
 
 
 def _field(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array, " components"]) -> diffrax.ODETerm:
@@ -384,7 +381,7 @@ def follow(
     - `t1`: horizon [s].
     - `settings`: their solver can be any solver of Diffrax. A run that needs more than `max_steps` steps, including
       rejected ones, fails.
-    - `first`: length of the first step [s], by default selected as Diffrax does.
+    - `first`: length of the first step [s], by default `FIRST_STEP`.
     - `t0`: time at which the run starts [s].
     - `dense`: whether to keep dense output for states within the steps (`DenseSolution.at`).
     - `piece`: number of steps that are integrated at once.
@@ -401,8 +398,9 @@ def follow(
     [[0.367879 0.135335]]
     """
     time, end = jnp.asarray(t0, float), jnp.asarray(t1, float)
-    state, scales, margin, length = _start(problem, time, end, settings, dense)
-    length = length if first is None else jnp.asarray(first, float)
+    state, scales, margin = _start(problem, time)
+    # Always a number, so that the program serves the first piece of a run and the later ones.
+    length = jnp.asarray(FIRST_STEP if first is None else first, float)
     times, states, segments = [np.full(1, t0)], [np.asarray(state)[:, None]], []
     accepted, rejected, lost, failed = 0, 0, False, False
     # The program is compiled for this number of steps, so it must not change with the number that is left.
