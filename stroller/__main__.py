@@ -207,12 +207,8 @@ def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[Stage]:
 
 def simulated(options: argparse.Namespace) -> tuple[Plan, dict[Name, Trajectory], list[str]]:
     """The plan, the rides, and the lines of their audit; the plan and the lines are printed as soon as they are known."""
-    rides, audits, helm, scenes_to_run = (
-        {},
-        [HEADING],
-        Helm(options.force, options.steer, options.period),
-        scenes(options),
-    )
+    rides, audits = {}, [HEADING]
+    helm, scenes_to_run = Helm(options.force, options.steer, options.period), scenes(options)
     # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
     with Progress(len(scenes_to_run) + 2, "ride") as display, ThreadPoolExecutor(2) as threads:
         display.begin()
