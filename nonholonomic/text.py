@@ -219,7 +219,8 @@ def require_unit(unit: object) -> None:
     """Raise `ValueError` unless this is `None`, a unit that pictures can show, or a list of such units."""
     known = [name for readable, names in UNITS.items() if readable != "1" for name in names]
     names = [unit] if isinstance(unit, str) else unit
-    if unit is not None and not (isinstance(names, list | tuple) and {*known, *SYNONYMS}.issuperset(names)):
+    legal = [*known, *SYNONYMS]
+    if unit is not None and not (isinstance(names, list | tuple) and all(name in legal for name in names)):
         listed, hint = ", ".join(known), likely(unit, known)
         raise ValueError(f"unit = {shown(unit)} must be one of {listed}, or a list of them{hint}")
 
@@ -341,22 +342,28 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
 
 
-def distinguishing_labels(starts: list[tuple[str, ...]], *groups: list[Any], unit: Unit = None) -> list[str]:
+def distinguishing_labels(
+    starts: list[tuple[str, ...]], *groups: list[Any], unit: Unit = None, longest: int | None = MOST_CHARACTERS
+) -> list[str]:
     """Labels that distinguish runs, by what differs between them only.
 
     **Arguments:** `starts`: for each run, the same number of texts, such as its angle and its spin; `groups`: modules of
-    one role, such as the scenes, one per run; `unit`: units for their numbers, as for `in_unit`.
+    one role, such as the scenes, one per run; `unit`: units for their numbers, as for `in_unit`; `longest`: the number of
+    characters that a label may have, `None` for any.
 
-    **Returns:** the labels, which end in "…" where more differs than `MOST_CHARACTERS` can say. If nothing differs, a label is
-    the whole start; equal labels are numbered.
+    **Returns:** the labels; one that would be longer ends in "…". If nothing differs, a label is the whole start; equal labels
+    are numbered.
     """
     differing = [k for k, texts in enumerate(zip(*starts, strict=True)) if len(set(texts)) > 1]
     parts = [[start[k] for k in differing] for start in starts]
     for group in groups:
         parts = [part + difference for part, difference in zip(parts, differences(group, unit), strict=True)]
     names = [", ".join(part or start) for part, start in zip(parts, starts, strict=True)]
-    ends = [name.rfind(", ", 0, MOST_CHARACTERS) if len(name) > MOST_CHARACTERS else len(name) for name in names]
-    names = [name[:end] + ", …" * (end < len(name)) for name, end in zip(names, ends, strict=True)]
+    if longest is not None:
+        # Cut after the last part that is whole, if any is.
+        ends = [name.rfind(", ", 0, longest + 2) if len(name) > longest else len(name) for name in names]
+        ends = [longest if end < 0 else end for end in ends]
+        names = [name[:end] + ", …" * (end < len(name)) for name, end in zip(names, ends, strict=True)]
     count = names.count
     return [name if count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)]
 

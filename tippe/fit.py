@@ -185,7 +185,7 @@ class AbstractTimes(AbstractEventTimes):
             jax.tree.map(lambda leaf, k=k: leaf if jnp.ndim(leaf) == 0 else leaf[k], self.launch)
             for k in range(self.size)
         ]
-        return tuple(distinguishing_labels([("launch",)] * self.size, launches, unit=unit))
+        return tuple(distinguishing_labels([("launch",)] * self.size, launches, unit=unit, longest=None))
 
 
 class InversionTimes(AbstractTimes):

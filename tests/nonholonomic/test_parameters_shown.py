@@ -98,6 +98,7 @@ def test_labels_of_runs_leave_room_for_the_picture():
     assert long == ["aaaaaaaaaaaaaaaaaaaa, c", "dddddddddddddddddddd, e", "aaaaaaaaaaaaaaaaaaaa, f"]
     cut = distinguishing_labels([("a" * 20, "b" * 20), ("a" * 20, "c" * 20), ("d", "b" * 20)])
     assert cut == ["aaaaaaaaaaaaaaaaaaaa, … (1)", "aaaaaaaaaaaaaaaaaaaa, … (2)", "d, bbbbbbbbbbbbbbbbbbbb"]
+    assert distinguishing_labels([("a" * 40,), ("b",)]) == [f"{'a' * 30}, …", "b"]
 
 
 def test_numbers_are_shown_in_other_units():

@@ -46,7 +46,14 @@ def test_a_scene_tells_its_numbers_with_units():
             "I1 = 29.94 kg m², I3 = 32 kg m² are unusual for a top: were they in g cm^2? Then I1=2.994e-06",
         ),
         ({"mass": 20.0}, "mass = 20 kg is unusual for a top: was it in g? Then mass=0.02"),
-        ({"I1": [2.994e-6, 1e-3], "I3": 3.2e-6}, "are mass, radius and I1 in kg, m and kg m^2"),
+        (
+            {"I1": [2.994e-6, 1e-3], "I3": 3.2e-6},
+            "I1 = 125 m R^2 is unusual for a top: are mass, radius and I1 in kg, m",
+        ),
+        (
+            {"mass": [0.02, 1.0, 20.0], "I1": [3e-6, 1.5e-4, 3e-3], "I3": [3.2e-6, 1.6e-4, 3.2e-3]},
+            "mass = 5.97e+05 kg/m^3",
+        ),
         # All in g and mm, with the moments of inertia in SI units or in g mm^2.
         (
             {"mass": 18.0, "radius": 19.0, "offset": 6.0},
