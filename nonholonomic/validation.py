@@ -427,6 +427,15 @@ def explaining(constructor: Constructor) -> Constructor:
 Explaining: Any = type("Explaining", (type(eqx.Module),), {"__call__": explaining(type(eqx.Module).__call__)})
 
 
+#: Ranges of a number, as the metadata of its field.
+POSITIVE, NOT_NEGATIVE = {"range": {"above": 0.0}}, {"range": {"at_least": 0.0}}
+
+
+def _parts(name: str, value: Any) -> dict[str, Any]:
+    """The numbers of a field by their names: one number, or those of a tuple."""
+    return {f"{name}[{k}]": part for k, part in enumerate(value)} if isinstance(value, tuple) else {name: value}
+
+
 class Bounded(eqx.Module, metaclass=Explaining):
     """A module whose numbers have ranges and units; concrete numbers out of range raise an error."""
 
@@ -436,13 +445,19 @@ class Bounded(eqx.Module, metaclass=Explaining):
     #: What to do about an argument that is missing, or that the constructor does not have, by name.
     advice: ClassVar[dict[str, str]] = {}
 
-    def bounds(self) -> Iterable[Bound]:
-        """The ranges of the module's own numbers, in the order in which they are to be checked.
+    def bounds(self) -> Iterator[Bound]:
+        """The ranges of the module's own numbers, in the order in which they are to be checked: those that the fields
+        declare as metadata, such as `POSITIVE`; any other number with a unit must be finite, unless it is omitted. A
+        class adds the ranges that depend on its other numbers.
 
         This is a generator, so that a range computed from another number is computed only after that number has been
         checked.
         """
-        return ()
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            limits = field.metadata.get("range", {} if field.name in self.units else None)
+            if value is not None and limits is not None:
+                yield from (Bound(part, name, **limits) for name, part in _parts(field.name, value).items())
 
     def suspicion(self) -> str | None:
         """A possible mistake in legal numbers, such as another unit, as text; `None` if there is none."""
@@ -461,9 +476,7 @@ class Bounded(eqx.Module, metaclass=Explaining):
             return
         shapes = {}
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            parts = {f"{field.name}[{k}]": part for k, part in enumerate(value)} if isinstance(value, tuple) else {}
-            for name, part in (parts or {field.name: value}).items():
+            for name, part in _parts(field.name, getattr(self, field.name)).items():
                 if isinstance(part, jax.Array | np.ndarray):
                     shapes[name] = np.shape(part)
                     if 0 in shapes[name]:

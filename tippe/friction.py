@@ -3,20 +3,28 @@ returns."""
 
 import abc
 import math
-from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from nonholonomic.compilation.components import held, map_methods
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
 from nonholonomic.text import one_line, shown
-from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced, largest, require_kind
+from nonholonomic.validation import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    UNTRACEABLE,
+    Bounded,
+    as_number,
+    is_traced,
+    largest,
+    require_kind,
+)
 
 # Argument and result of a friction law: the motion at the contact, and force and torque per unit normal force.
 
@@ -110,7 +118,14 @@ class AbstractFriction(Bounded):
     def suspicion(self) -> str | None:
         # The laws of this package oppose every slip. Traced numbers have no values to judge.
         is_own = str(type(self).per_normal_force.__module__).startswith("tippe.")
-        return None if is_own or is_traced(self) else drive(as_law(self))
+        if not is_own:
+            return None if is_traced(self) else drive(as_law(self))
+        mu = largest(getattr(self, "mu", 0.0)) if self.units.get("mu") == "1" else 0.0
+        if mu > GREATEST_MU:
+            return f"mu = {mu:g} is large for a coefficient of friction: was it in %? {mu:g} % are {mu / 100.0:g}"
+        if (speed := largest(getattr(self, "slip_speed", 0.0))) > GREATEST_SLIP_SPEED:
+            return f"slip_speed = {speed:g} m/s is large: was it in mm/s? {speed:g} mm/s are {speed / 1e3:g} m/s"
+        return None
 
     @abc.abstractmethod
     def per_normal_force(self, slip: Slip) -> ContactLoad:
@@ -174,10 +189,7 @@ class Viscous(AbstractFriction):
     units: ClassVar[dict[str, str]] = {"mu": "s m-1"}
     isotropic: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mu, "mu", at_least=0.0)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         return ContactLoad(force=(-self.mu * slip.x, -self.mu * slip.y))
@@ -213,15 +225,8 @@ class Coulomb(AbstractFriction):
     advice: ClassVar[dict[str, str]] = ADVICE
     isotropic: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number)
-    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mu, "mu", at_least=0.0)
-        yield Bound(self.slip_speed, "slip_speed", above=0.0)
-
-    def suspicion(self) -> str | None:
-        return suspected_unit(self.mu, self.slip_speed)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + self.slip_speed * self.slip_speed)
@@ -264,17 +269,9 @@ class Contensou(AbstractFriction):
     uses_spin: ClassVar[bool] = True
     isotropic: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number)
-    contact_radius: Float[Array, "..."] = eqx.field(converter=as_number)
-    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mu, "mu", at_least=0.0)
-        yield Bound(self.contact_radius, "contact_radius", at_least=0.0)
-        yield Bound(self.slip_speed, "slip_speed", above=0.0)
-
-    def suspicion(self) -> str | None:
-        return suspected_unit(self.mu, self.slip_speed)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    contact_radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         lever = 3.0 * math.pi / 16.0 * self.contact_radius
@@ -310,8 +307,8 @@ class Rolling(AbstractFriction):
     ```
     """
 
-    resistance: Float[Array, "..."] = eqx.field(converter=as_number)
-    turning_speed: Float[Array, "..."] = eqx.field(converter=as_number)
+    resistance: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    turning_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
     sliding: AbstractFriction
 
     def __check_init__(self):
@@ -320,10 +317,6 @@ class Rolling(AbstractFriction):
             raise ValueError(
                 f"sliding = {shown(self.sliding)} must be a sliding law with a force at every slip velocity"
             )
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.resistance, "resistance", at_least=0.0)
-        yield Bound(self.turning_speed, "turning_speed", above=0.0)
 
     @property
     def units(self) -> dict[str, str]:
@@ -399,13 +392,7 @@ class SetValuedCoulomb(AbstractFriction):
     units: ClassVar[dict[str, str]] = {"mu": "1"}
     set_valued: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mu, "mu", at_least=0.0)
-
-    def suspicion(self) -> str | None:
-        return suspected_unit(self.mu)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         """The load of a slipping contact; at zero slip, where the law does not define it, the load is 0."""
@@ -463,12 +450,3 @@ def _power(law: AbstractFriction, slip: Slip) -> Component:
     if not isinstance(load, ContactLoad):
         raise NoLoad
     return load.power(slip)
-
-
-def suspected_unit(mu: ArrayLike, slip_speed: ArrayLike = 0.0) -> str | None:
-    """The suspicion that numbers of Coulomb's law are in another unit; `None` if they are not."""
-    if (greatest := largest(mu)) > GREATEST_MU:
-        return f"mu = {greatest:g} is large for a coefficient of friction: was it in %? {greatest:g} % are {greatest / 100.0:g}"
-    if (greatest := largest(slip_speed)) > GREATEST_SLIP_SPEED:
-        return f"slip_speed = {greatest:g} m/s is large: was it in mm/s? {greatest:g} mm/s are {greatest / 1e3:g} m/s"
-    return None

@@ -7,7 +7,7 @@ lane, so write it with `jax.numpy` and without `if`. Use an `equinox.Module` for
 import contextlib
 import functools
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -21,9 +21,7 @@ from nonholonomic.compilation.components import TooLarge, by_components, over_la
 from nonholonomic.compilation.tracing import TracedFunction, in_cells, is_elementary, jumps_of, warn_of_unclear
 from nonholonomic.geometry import Vector
 from nonholonomic.text import AbstractHeld, is_users, name_of, shown
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced
-
-from .vehicle import bounds_of
+from nonholonomic.validation import Bounded, as_number, is_traced
 
 
 class Motion(NamedTuple):
@@ -84,9 +82,6 @@ class Steady(Bounded):
 
     force: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     torque: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
-
-    def bounds(self) -> Iterator[Bound]:
-        return bounds_of(self, "force", "torque")
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         return self.force, self.torque

@@ -15,6 +15,7 @@ from nonholonomic.geometry.surface import as_surface
 from nonholonomic.integration import AbstractProblem, Jumps
 from nonholonomic.text import is_array, is_users, parted, shown, suspected_gravity
 from nonholonomic.validation import (
+    NOT_NEGATIVE,
     Bound,
     Bounded,
     all_bounds,
@@ -102,7 +103,7 @@ class Scene(Bounded):
     body: Stroller
     surface: AbstractSurface = eqx.field(converter=as_surface, default=Plane())
     friction: AbstractFriction = eqx.field(converter=as_law, default=Frictionless())
-    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
+    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=NOT_NEGATIVE)
     side: str | None = eqx.field(static=True, default=None)
     fork: str = eqx.field(static=True, default="relative")
     heading: str = eqx.field(static=True, default="intrinsic")
@@ -122,7 +123,7 @@ class Scene(Bounded):
             raise ValueError(f"heading = 'projected' must be 'intrinsic' on a {type(self.surface).__name__}")
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.gravity, "gravity", at_least=0.0)
+        yield from super().bounds()
         surface, half = self.surface, 0.5 * self.body.wheelbase
         why = "half the wheelbase, as both axles touch the surface"
         if isinstance(surface, Sphere):

@@ -25,7 +25,7 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.parameters import as_one
 from nonholonomic.text import shown
-from nonholonomic.validation import IN_DEGREES, Bound, Bounded, Converted, as_number, largest
+from nonholonomic.validation import IN_DEGREES, NOT_NEGATIVE, POSITIVE, Bound, Bounded, Converted, as_number, largest
 
 
 def as_numbers(value: Any) -> Any:
@@ -34,18 +34,6 @@ def as_numbers(value: Any) -> Any:
         return tuple(as_number(number) for number in tuple(value))
     except TypeError:
         return value
-
-
-def bounds_of(
-    module: Bounded, *names: str, above: float | None = None, at_least: float | None = None
-) -> Iterator[Bound]:
-    """The same limits for several numbers of a module, and for each of those in a tuple; `None` has no limits."""
-    for name in names:
-        value = getattr(module, name)
-        if isinstance(value, tuple):
-            yield from (Bound(number, f"{name}[{k}]", above, at_least) for k, number in enumerate(value))
-        elif value is not None:
-            yield Bound(value, name, above, at_least)
 
 
 # The body: a rigid frame on two rear wheels, with one front wheel in a fork that steers.
@@ -82,12 +70,12 @@ class Stroller(Bounded):
     units: ClassVar[dict[str, str]] = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2"}
     units |= {"steering_spring": "N m rad-1", "centre": "m"}
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number)
-    wheelbase: Float[Array, "..."] = eqx.field(converter=as_number)
-    inertia: Float[Array, "..."] = eqx.field(converter=as_number)
-    steering_inertia: Float[Array, "..."] = eqx.field(converter=as_number)
-    steering_spring: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
-    centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    wheelbase: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    steering_inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    steering_spring: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None, metadata=NOT_NEGATIVE)
+    centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None, metadata=NOT_NEGATIVE)
 
     def suspicion(self) -> str | None:
         longest = largest(self.wheelbase)
@@ -97,8 +85,7 @@ class Stroller(Bounded):
         return f"wheelbase = {longest:g} m is long: was it in {unit}? {longest:g} {unit} are {metres:g} m"
 
     def bounds(self) -> Iterator[Bound]:
-        yield from bounds_of(self, "mass", "wheelbase", "inertia", "steering_inertia", above=0.0)
-        yield from bounds_of(self, "steering_spring", "centre", at_least=0.0)
+        yield from super().bounds()
         if self.centre is not None:
             yield Bound(self.centre, "centre", at_most=self.wheelbase, why="the wheelbase")
             min_inertia = self.mass * self.centre**2
@@ -220,13 +207,10 @@ class Damping(AbstractFriction):
 
     units: ClassVar[dict[str, str]] = {"rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "steering": "N m s"}
 
-    rolling: Float[Array, "..."] = eqx.field(converter=as_number)
-    front: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
-    scrub: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
-    steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
-
-    def bounds(self) -> Iterator[Bound]:
-        return bounds_of(self, "rolling", "front", "scrub", "steering", at_least=0.0)
+    rolling: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    front: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=NOT_NEGATIVE)
+    scrub: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=NOT_NEGATIVE)
+    steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=NOT_NEGATIVE)
 
     def drag(self, wheels: WheelMotion) -> Drag:
         return Drag(
@@ -261,12 +245,8 @@ class RollingResistance(AbstractFriction):
 
     units: ClassVar[dict[str, str]] = {"coefficient": "1", "speed": "m s-1"}
 
-    coefficient: Float[Array, "..."] = eqx.field(converter=as_number)
-    speed: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield from bounds_of(self, "coefficient", at_least=0.0)
-        yield from bounds_of(self, "speed", above=0.0)
+    coefficient: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
 
     def drag(self, wheels: WheelMotion) -> Drag:
         return Drag(
@@ -419,6 +399,3 @@ class Launch(Bounded):
         if fastest > FASTEST:
             return f"speed = {fastest:g} m/s is fast: was it in km/h? {fastest:g} km/h are {fastest / 3.6:.4g} m/s"
         return suspected_degrees(self)
-
-    def bounds(self) -> Iterator[Bound]:
-        return bounds_of(self, "place", "heading", "speed", "steering", "steering_rate")

@@ -14,6 +14,8 @@ from nonholonomic.geometry import AbstractSurface, Plane, cross, scale
 from nonholonomic.integration.problem import require_run
 from nonholonomic.text import shown
 from nonholonomic.validation import (
+    NOT_NEGATIVE,
+    POSITIVE,
     Bound,
     Bounded,
     as_number,
@@ -28,7 +30,7 @@ from nonholonomic.validation import (
 
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import Scene
-from ..model.vehicle import Launch, Stroller, as_numbers, as_place, bounds_of, suspected_degrees
+from ..model.vehicle import Launch, Stroller, as_numbers, as_place, suspected_degrees
 
 #: Numbers, and points (..., points, 2), in NumPy or in JAX.
 Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
@@ -79,16 +81,12 @@ class Box(Bounded):
     units: ClassVar[dict[str, str]] = {"centre": "m", "size": "m", "angle": "rad"}
 
     centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
-    size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
+    size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers, metadata=POSITIVE)
     angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
 
     def __check_init__(self):
         require_pair(self.centre, "centre", "(1.0, 0.5)")
         require_pair(self.size, "size", "(0.5, 0.25)")
-
-    def bounds(self) -> Iterator[Bound]:
-        yield from bounds_of(self, "centre", "angle")
-        yield from bounds_of(self, "size", above=0.0)
 
     @property
     def corners(self) -> Float[np.ndarray, "4 2"]:
@@ -125,14 +123,10 @@ class Disc(Bounded):
     units: ClassVar[dict[str, str]] = {"centre": "m", "radius": "m"}
 
     centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
-    radius: Float[Array, ""] = eqx.field(converter=as_number)
+    radius: Float[Array, ""] = eqx.field(converter=as_number, metadata=POSITIVE)
 
     def __check_init__(self):
         require_pair(self.centre, "centre", "(1.0, 0.5)")
-
-    def bounds(self) -> Iterator[Bound]:
-        yield from bounds_of(self, "centre")
-        yield from bounds_of(self, "radius", above=0.0)
 
     def distance(self, polygon: Points) -> Numbers:
         """The exact distance [m] of polygons from the disc, negative where they overlap."""
@@ -161,13 +155,12 @@ class Footprint(Bounded):
 
     units: ClassVar[dict[str, str]] = {"length": "m", "width": "m", "rear": "m"}
 
-    length: Float[Array, ""] = eqx.field(converter=as_number)
-    width: Float[Array, ""] = eqx.field(converter=as_number)
-    rear: Float[Array, ""] = eqx.field(converter=as_number)
+    length: Float[Array, ""] = eqx.field(converter=as_number, metadata=POSITIVE)
+    width: Float[Array, ""] = eqx.field(converter=as_number, metadata=POSITIVE)
+    rear: Float[Array, ""] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
 
     def bounds(self) -> Iterator[Bound]:
-        yield from bounds_of(self, "length", "width", above=0.0)
-        yield Bound(self.rear, "rear", at_least=0.0)
+        yield from super().bounds()
         yield Bound(self.rear, "rear", at_most=self.length, why="the length")
 
     @classmethod
@@ -328,14 +321,10 @@ class Goal(Bounded):
     place: tuple[Float[Array, ""], ...] = eqx.field(converter=as_place)
     heading: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     speed: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    within: Float[Array, ""] = eqx.field(converter=as_number, default=0.05)
+    within: Float[Array, ""] = eqx.field(converter=as_number, default=0.05, metadata=POSITIVE)
 
     def suspicion(self) -> str | None:
         return suspected_degrees(self)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield from bounds_of(self, "place", "heading", "speed")
-        yield from bounds_of(self, "within", above=0.0)
 
 
 def as_range(value: Any) -> Any:
@@ -392,9 +381,9 @@ class Limits(Bounded):
         return suspected_degrees(self)
 
     def bounds(self) -> Iterator[Bound]:
+        yield from super().bounds()
         for name in self.units:
             if (value := getattr(self, name)) is not None:
-                yield Bound(value[0], f"{name}[0]")
                 yield Bound(value[1], f"{name}[1]", above=value[0], why="the lower bound")
 
     def ranges(self) -> dict[str, tuple[float, float]]:

@@ -24,7 +24,17 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, as_function, scale, sum_vectors
 from nonholonomic.text import readable_unit, shown
-from nonholonomic.validation import Bound, Bounded, as_number, explaining, is_traced, require, warn
+from nonholonomic.validation import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Bound,
+    Bounded,
+    as_number,
+    explaining,
+    is_traced,
+    require,
+    warn,
+)
 
 
 class ContactGeometry(NamedTuple):
@@ -93,9 +103,7 @@ class AbstractBody(Bounded):
         return (-r1, -r2, -r3 - self.size)
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mass, "mass", above=0.0)
-        yield Bound(self.I1, "I1", above=0.0)
-        yield Bound(self.I3, "I3", above=0.0)
+        yield from super().bounds()
         yield Bound(self.I3, "I3", at_most=2.0 * self.I1, why="I3 <= 2 I1 for every rigid body")
 
 
@@ -287,11 +295,11 @@ class Top(AbstractBody):
     advice: ClassVar[dict[str, str]] = {"diameter": "the radius is half the diameter"}
     advice |= dict.fromkeys(("offset", "I1", "I3"), "Top.turned computes offset, I1 and I3 from the shape")
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number)
-    radius: Float[Array, "..."] = eqx.field(converter=as_number)
-    offset: Float[Array, "..."] = eqx.field(converter=as_number)
-    I1: Float[Array, "..."] = eqx.field(converter=as_number)
-    I3: Float[Array, "..."] = eqx.field(converter=as_number)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    offset: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    I1: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    I3: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
     stem: Stem | None = None
     #: The lengths that `turned` has assumed, as text.
     assumed: str | None = eqx.field(static=True, default=None, init=False)
@@ -379,8 +387,6 @@ class Top(AbstractBody):
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
-        yield Bound(self.radius, "radius", above=0.0)
-        yield Bound(self.offset, "offset", at_least=0.0)
         yield Bound(self.offset, "offset", below=self.radius, why="the centre of mass lies inside the sphere")
         if self.stem is not None:
             reach = self.offset + jnp.abs(self.radius - self.stem.radius)
@@ -497,18 +503,15 @@ class SpheroidBody(AbstractBody):
     units: ClassVar[dict[str, str]] = {"mass": "kg", "equatorial": "m", "polar": "m", "I1": "kg m2", "I3": "kg m2"}
     units |= {"offset": "m"}
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number)
-    equatorial: Float[Array, "..."] = eqx.field(converter=as_number)
-    polar: Float[Array, "..."] = eqx.field(converter=as_number)
-    I1: Float[Array, "..."] = eqx.field(converter=as_number)
-    I3: Float[Array, "..."] = eqx.field(converter=as_number)
-    offset: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    equatorial: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    polar: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    I1: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    I3: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    offset: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=NOT_NEGATIVE)
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
-        yield Bound(self.equatorial, "equatorial", above=0.0)
-        yield Bound(self.polar, "polar", above=0.0)
-        yield Bound(self.offset, "offset", at_least=0.0)
         yield Bound(self.offset, "offset", below=self.polar, why="the centre of mass lies inside the spheroid")
 
     @property
@@ -572,10 +575,10 @@ class ConvexBody(AbstractBody):
 
     units: ClassVar[dict[str, str]] = {"mass": "kg", "I1": "kg m2", "I3": "kg m2"}
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
     support: Any = eqx.field(converter=lambda value: as_function(value, "support", ("c",)))
-    I1: Float[Array, "..."] = eqx.field(converter=as_number)
-    I3: Float[Array, "..."] = eqx.field(converter=as_number)
+    I1: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    I3: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()

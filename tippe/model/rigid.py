@@ -41,7 +41,7 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.integration import Components, States
 from nonholonomic.text import shown
-from nonholonomic.validation import UNTRACEABLE, ArrayOrList, Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import POSITIVE, UNTRACEABLE, ArrayOrList, Bound, Bounded, as_number, is_traced
 
 from ..friction import AbstractFriction, ContactLoad, Slip
 from .dynamics import (
@@ -132,8 +132,7 @@ class Inertia(Bounded):
 
     def bounds(self) -> Iterator[Bound]:
         xx, yy, zz, xy, xz, yz = self.tensor
-        for name, number in zip(COMPONENTS, self.tensor, strict=True):
-            yield Bound(number, name)
+        yield from super().bounds()
         half = 0.5 * (xx + yy + zz)
         # Half the trace minus the tensor is the matrix of the second moments of the mass, which is positive
         # semidefinite; the tensor is positive definite. Both are divided by powers of the trace, so that rounding
@@ -256,11 +255,6 @@ class AbstractRigidBody(Bounded):
         point, point_rate = self.surface_point(normal, rate)
         return sum_vectors(point, scale(-1.0, self.centre_of_mass)), point_rate
 
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.mass, "mass", above=0.0)
-        for k in range(3):
-            yield Bound(self.centre_of_mass[k], f"centre_of_mass[{k}]")
-
 
 #: Units of the common parameters of rigid bodies, with their names in scenes and tables.
 UNITS = {"mass": "kg", "centre_of_mass": "m"} | {f"centre_of_mass[{k}]": "m" for k in range(3)} | Inertia.units
@@ -308,15 +302,15 @@ class Ellipsoid(AbstractRigidBody):
 
     units: ClassVar[dict[str, str]] = UNITS | {"semi_axes": "m"} | {f"semi_axes[{k}]": "m" for k in range(3)}
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number)
-    semi_axes: tuple[Float[Array, "..."], ...] = eqx.field(converter=several("semi_axes", (3,), ALONG_AXES))
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    semi_axes: tuple[Float[Array, "..."], ...] = eqx.field(
+        converter=several("semi_axes", (3,), ALONG_AXES), metadata=POSITIVE
+    )
     centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(converter=several("centre_of_mass", (3,), ALONG_AXES))
     inertia: Inertia = eqx.field(converter=Inertia.of)
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
-        for k in range(3):
-            yield Bound(self.semi_axes[k], f"semi_axes[{k}]", above=0.0)
         depth = sum((place / axis) ** 2 for place, axis in zip(self.centre_of_mass, self.semi_axes, strict=True))
         yield Bound(depth, "sum of (centre_of_mass / semi_axes)^2", below=1.0, why="the centre of mass lies inside")
 
@@ -376,7 +370,7 @@ class RigidBody(AbstractRigidBody):
 
     units: ClassVar[dict[str, str]] = UNITS
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
     inertia: Inertia = eqx.field(converter=Inertia.of)
     support: Any = eqx.field(converter=lambda value: as_support(value))
     centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(

@@ -32,7 +32,17 @@ from nonholonomic.geometry.surface import as_surface
 from nonholonomic.integration import Components, States
 from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import likely_fix, shown, suspected_gravity
-from nonholonomic.validation import Bound, Bounded, as_number, explaining, largest, require, require_all, require_kind
+from nonholonomic.validation import (
+    POSITIVE,
+    Bound,
+    Bounded,
+    as_number,
+    explaining,
+    largest,
+    require,
+    require_all,
+    require_kind,
+)
 
 from ..friction import A_LAW, AbstractFriction, Frictionless, NoSlip, SetValuedCoulomb, as_law
 from .body import AbstractBody, Top
@@ -52,6 +62,10 @@ from .stick_slip import StickSlip
 
 #: Spins above this [rad/s] suggest revolutions per minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
 FASTEST = 1000.0
+
+#: Ranges of angles of a launch.
+INCLINATION = {"range": {"at_least": 0.0, "at_most": math.pi, "unit": "rad"}}
+HALF_TURN = {"range": {"at_least": -math.pi, "at_most": math.pi, "unit": "rad"}}
 
 #: What to do where the spin is missing, or in another unit.
 SPINS = "Launch takes spin in rad/s, Launch.degrees takes rpm: 20 turns a second are spin=125.7 or rpm=1200"
@@ -98,9 +112,9 @@ class Launch(Bounded):
     units |= {"place": "m or rad", "velocity": "m s-1", "angular_velocity": "rad s-1"}
     advice: ClassVar[dict[str, str]] = dict.fromkeys(("spin", "rpm"), SPINS)
 
-    theta: Float[Array, "..."] = eqx.field(converter=as_number)
+    theta: Float[Array, "..."] = eqx.field(converter=as_number, metadata=INCLINATION)
     spin: Float[Array, "..."] = eqx.field(converter=as_number)
-    eta: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    eta: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=HALF_TURN)
     azimuth: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     place: tuple[Float[Array, "..."], ...] | None = eqx.field(
         converter=several("place", (2, 3), "(x, y), (mu, eta) or (x, y, z)", True), default=None, kw_only=True
@@ -158,15 +172,9 @@ class Launch(Bounded):
         )
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.theta, "theta", at_least=0.0, at_most=math.pi, unit="rad")
-        yield Bound(self.spin, "spin")
-        yield Bound(self.eta, "eta", at_least=-math.pi, at_most=math.pi, unit="rad")
+        yield from super().bounds()
         if self.place is not None:
             yield Bound(self.eta, "eta", at_least=0.0, at_most=0.0, why="place is given")
-        yield Bound(self.azimuth, "azimuth")
-        for name in ("place", "velocity", "angular_velocity"):
-            for k, number in enumerate(getattr(self, name) or ()):
-                yield Bound(number, f"{name}[{k}]")
 
 
 def as_launch(value: Any) -> Any:
@@ -236,9 +244,11 @@ class Scene(Bounded, Generic[Body]):
     body: Body
     surface: AbstractSurface = eqx.field(converter=as_surface, default=Plane())
     friction: AbstractFriction = eqx.field(converter=as_law, default=Frictionless())
-    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
+    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=POSITIVE)
     contact: str = eqx.field(static=True, default="stop")
-    restitution: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
+    restitution: Float[Array, "..."] | None = eqx.field(
+        converter=none_if_zero, default=None, metadata={"range": {"at_least": 0.0, "at_most": 1.0}}
+    )
     side: str | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -288,7 +298,7 @@ class Scene(Bounded, Generic[Body]):
             )
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.gravity, "gravity", above=0.0)
+        yield from super().bounds()
         if not isinstance(self.surface, Plane):
             # The radius that a closed arena must exceed so that the body can be inside.
             room = self.body.size
@@ -296,8 +306,6 @@ class Scene(Bounded, Generic[Body]):
                 lowest, highest = self.body.half_widths
                 room = highest if isinstance(self.surface, Sphere) else lowest
             yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), room)
-        if self.restitution is not None:
-            yield Bound(self.restitution, "restitution", at_least=0.0, at_most=1.0)
 
     def suspicion(self) -> str | None:
         for name, value in numbers("surface", self.surface, functions=False).items():
