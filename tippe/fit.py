@@ -332,24 +332,18 @@ def read_inversion_times(
                 )
     is_stated = np.isfinite(table.until)
     limits = np.where(is_stated, table.until, t1 if until is None else until) if np.any(is_stated) else until
-    launches = _launches(table.numbers, launch)
-    times: Any = {"time": table.time, "error": table.error, "t1": t1, "until": limits}
-    return InversionTimes(launch=launches, **times, angle=angle, student=student)
-
-
-def _launches(numbers: dict[str, np.ndarray], launch: Launch | None) -> Launch:
-    """The launches of a file."""
     if launch is not None:
         require_kind(launch, "launch", Launch)
         require_scalars({name: getattr(launch, name) for name in UNITS}, "the file has the numbers that differ")
-        return dataclasses.replace(launch, **numbers)
-    for name in ("theta", "spin"):
-        if name not in numbers:
+    for name in ("theta", "spin") if launch is None else ():
+        if name not in table.numbers:
             raise ValueError(
                 f"columns must have {name!r}, or launch must be a Launch with the {name} of all launches, such as "
                 "launch=tippe.Launch(theta=0.1, spin=150.0)"
             )
-    return Launch(**numbers)
+    launches = Launch(**table.numbers) if launch is None else dataclasses.replace(launch, **table.numbers)
+    times: Any = {"time": table.time, "error": table.error, "t1": t1, "until": limits}
+    return InversionTimes(launch=launches, **times, angle=angle, student=student)
 
 
 # Recorded runs of tops, from arrays and from files.

@@ -79,16 +79,11 @@ def _require_one_scene(scene: Scene, **values: object) -> None:
     require_scalars(numbers("scene", scene, functions=False) | values, MANY)
 
 
-def _require_scene_of_a_top(scene: Scene) -> None:
-    """Raise `ValueError` unless this is a scene of a `Top`."""
+def _require_scene_of_a_top(scene: Scene, any_arena: bool = False) -> None:
+    """Raise `ValueError` unless this is a scene of a `Top`, on a level plane if not on `any_arena`."""
     require_kind(scene, "scene", Scene)
     _require_top(scene.body)
-
-
-def _require_plane(scene: Scene) -> None:
-    """Raise `ValueError` unless this is a scene of a `Top` on a level plane."""
-    _require_scene_of_a_top(scene)
-    if not scene.level:
+    if not (scene.level or any_arena):
         raise ValueError(
             f"surface = {shown(scene.surface)} must be a Plane without tilt: on other arenas, no top tumbles steadily"
         )
@@ -204,7 +199,7 @@ def tumbling_angles(scene: Scene[Top], jellett: float, samples: int = 2001) -> l
     >>> print([round(theta, 3) for theta in steady.tumbling_angles(scene, float(jellett))])
     [1.0]
     """
-    _require_plane(scene)
+    _require_scene_of_a_top(scene)
     require(jellett, "jellett")
     _require_one_scene(scene, jellett=jellett)
     require_whole(samples, "samples", 4)
@@ -255,7 +250,7 @@ def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
 
 def _require_motion(scene: Scene[Top], motion: Tumbling) -> None:
     """Raise `ValueError` unless this is a scene on the plane and a motion from `tumbling`."""
-    _require_plane(scene)
+    _require_scene_of_a_top(scene)
     require_kind(motion, "motion", Tumbling, ", as tumbling(scene, theta) returns it")
 
 
@@ -264,7 +259,7 @@ def _lever_and_inertia(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> tup
 
     **Raises:** `ValueError` unless this is a scene on the plane, and theta an angle [rad] in [0, pi], or several.
     """
-    _require_plane(scene)
+    _require_scene_of_a_top(scene)
     require(theta, "theta", at_least=0.0, at_most=math.pi, unit="rad")
     alpha, _ = proportions(scene.body)
     s, c = jnp.sin(theta), jnp.cos(theta)
@@ -332,7 +327,7 @@ def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
     >>> print(f"{steady.upright_critical_spin(scene):.1f} rad/s")
     27.7 rad/s
     """
-    _require_scene_of_a_top(scene)
+    _require_scene_of_a_top(scene, any_arena=True)
     alpha, gamma = proportions(scene.body)
     weight = scene.body.mass * scene.gravity * scene.body.offset
     return _root_of_ratio(weight * (1.0 - alpha) ** 2 / scene.body.I3, gamma - 1.0 + alpha)
@@ -348,7 +343,7 @@ def inverted_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
     >>> print(f"{steady.inverted_critical_spin(scene):.1f} rad/s")
     41.3 rad/s
     """
-    _require_scene_of_a_top(scene)
+    _require_scene_of_a_top(scene, any_arena=True)
     (_, gamma), body = proportions(scene.body), scene.body
     sphere = body if body.stem is None else body.stem
     alpha, weight = sphere.offset / sphere.radius, body.mass * scene.gravity * sphere.offset
@@ -368,7 +363,7 @@ def jellett_thresholds(scene: Scene[Top]) -> tuple[Float[Array, "..."], Float[Ar
     >>> print(" ".join(f"{jellett:.2e}" for jellett in steady.jellett_thresholds(scene)))
     1.24e-06 3.44e-06
     """
-    _require_scene_of_a_top(scene)
+    _require_scene_of_a_top(scene, any_arena=True)
     (alpha, _), body = proportions(scene.body), scene.body
     if body.stem is not None:
         raise ValueError(
@@ -474,17 +469,14 @@ def _tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]
     state = tumbling_state(scene, motion)
     scales = scene.scales(Launch(motion.theta, motion.spin))
 
-    def field_in_frame(scaled_state):
-        """The rate of a scaled state in the frame that precesses."""
-        state = scaled_state * scales
-        return (scene.field(state) - motion.precession * quarter_turn(state)) / scales
-
+    # The rate in the frame that precesses.
+    jacobian = jax.jacfwd(lambda state: scene.field(state) - motion.precession * quarter_turn(state))(state)
     scaled_state = state / scales
     length = jax.grad(lambda x: jnp.sum((x * scales)[AXIS] ** 2))(scaled_state)
     jellett = jax.grad(lambda x: scene.jellett(x * scales))(scaled_state)
     excluded_directions = jnp.stack([length, jellett, quarter_turn(state) / scales], axis=1)
     basis = jnp.linalg.qr(excluded_directions / jnp.linalg.norm(excluded_directions, axis=0), mode="complete")[0][:, 3:]
-    return basis.T @ jax.jacfwd(field_in_frame)(scaled_state) @ basis
+    return basis.T @ (jacobian * scales / scales[:, None]) @ basis
 
 
 def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:

@@ -185,14 +185,12 @@ def slip_onset(
         factor = jnp.clip(0.8 * (tolerance / error) ** (1.0 / STAGES), 0.4, 0.8)
         return trial + 1, jnp.where(converged, duration, factor * duration), converged, rates
 
-    def goes_on(carry):
-        trial, _, converged, _ = carry
-        return (trial < TRIALS) & ~jnp.all(converged)
-
     duration = jnp.minimum(FIRST * tolerance ** (1.0 / STAGES) * contact.unit, max_duration)
     rates = jnp.zeros((*state.shape[:1], STAGES, *state.shape[1:]))
     _, duration, converged, rates = jax.lax.while_loop(
-        goes_on, shorten, (0, duration, jnp.zeros(duration.shape, bool), rates)
+        lambda carry: (carry[0] < TRIALS) & ~jnp.all(carry[2]),
+        shorten,
+        (0, duration, jnp.zeros(duration.shape, bool), rates),
     )
     return Onset(state, duration, rates, converged)
 

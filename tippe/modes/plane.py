@@ -187,12 +187,12 @@ def landing(descent: Descent, max_time: Lanes) -> tuple[Lanes, Bool[Array, " cel
         high = jnp.where(active & is_hit, jnp.where(dips, bottom, next_time), high)
         return low, high, located | (active & is_hit), is_over | (active & ~is_hit & (next_time >= end)), count + 1
 
-    def searching(carry):
-        _, _, located, is_over, count = carry
-        return jnp.any(~located & ~is_over) & (count < MOST_STRETCHES)
-
     zero, false = jnp.zeros_like(end), jnp.zeros(end.shape, bool)
-    low, high, located, is_over, _ = jax.lax.while_loop(searching, search, (zero, zero, false, false, 0))
+    low, high, located, is_over, _ = jax.lax.while_loop(
+        lambda carry: jnp.any(~carry[2] & ~carry[3]) & (carry[4] < MOST_STRETCHES),
+        search,
+        (zero, zero, false, false, 0),
+    )
     # At the very start, the distance is zero: it must have been positive since.
     time = halved(lambda t: descent.value(t) >= 0.0, low, high)[1]
     return jnp.where(located, time, jnp.inf), ~located & ~is_over
@@ -467,12 +467,16 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
             air_after, air_landed = self.hop(air, left)
             return air_landed, count + 1, _with_flight(self.scene.body, record, air, air_after)
 
-        def under_way(carry: tuple[Air, Array, TransitionPath | None]) -> Array:
-            return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
-
-        start = self.lost(state)
-        record = _no_flights(start) if self.with_quadratures else None
-        air, _, record = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int), record))
+        start, record = self.lost(state), None
+        if self.with_quadratures:
+            flight = TransitionPath(start.elapsed, (start.free, start.quadratures), start.flights)
+            record = jax.tree.map(lambda leaf: jnp.zeros((MOST_BOUNCES, *leaf.shape), leaf.dtype), flight)
+            record = record._replace(ends=jnp.inf + record.ends)
+        air, _, record = jax.lax.while_loop(
+            lambda carry: jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES),
+            hop,
+            (start, jnp.zeros((), int), record),
+        )
         return self.closed(air)._replace(record=record)
 
     def lost(self, state: States) -> Air:
@@ -599,16 +603,6 @@ def shown(body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."]) -> Floa
     distance = (gap(main, free), gap_rate(body, main, free))
     rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *quadratures[2:], *distance)
     return jnp.stack(jnp.broadcast_arrays(*rows))
-
-
-def _no_flights(start: Air) -> TransitionPath:
-    """An empty record for the flights of a single run."""
-
-    def room(leaf: Array) -> Array:
-        return jnp.zeros((MOST_BOUNCES, *leaf.shape), leaf.dtype)
-
-    motions = jax.tree.map(room, (start.free, start.quadratures))
-    return TransitionPath(jnp.inf + room(start.elapsed), motions, room(start.flights))
 
 
 def _with_flight(body: Top, record: TransitionPath | None, air_before: Air, air_after: Air) -> TransitionPath | None:

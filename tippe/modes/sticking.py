@@ -15,7 +15,7 @@ from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN, REACHED_END, 
 from ..model.body import Top
 from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, parts
 from ..model.scene import Scene
-from ..model.stick_slip import Change, ContactMode, Onset, StickSlip
+from ..model.stick_slip import ContactMode, Onset, StickSlip
 from .airborne import (
     FLYING,
     ON_STEM,
@@ -97,6 +97,13 @@ class StickSlipMode(AbstractBatchedMode):
         crossing = jnp.where(is_beyond, 0.0, change.wait + fraction * length)
         crosses |= is_beyond
         ends = crosses & (not self.last)
+        record = None
+        if self.passive is not None:
+            # The beginning of a slip, if there is one.
+            end = jnp.where(change.rolls | change.lost, jnp.inf, change.elapsed)[None]
+            record = TransitionPath(
+                end, jax.tree.map(lambda leaf: leaf[None], (onset, change.wait)), jnp.ones(end.shape, int)
+            )
         status = jnp.where(change.elapsed >= left, REACHED_END, RUNNING)
         status = jnp.where(change.lost, LEFT_DOMAIN, jnp.where(ends, CROSSED, status))
         return Transition(
@@ -106,7 +113,7 @@ class StickSlipMode(AbstractBatchedMode):
             status=status,
             crossing_time=jnp.where(crosses, crossing, jnp.inf),
             counts=(change.rolls & ~change.lost & ~is_beyond & (not self.kind.rolls)).astype(int)[None],
-            record=None if self.passive is None else _recorded(change),
+            record=record,
         )
 
     def _event(self, state: States) -> Lanes:
@@ -122,13 +129,6 @@ class StickSlipMode(AbstractBatchedMode):
         if self.passive is None:
             return problem
         return ExtendedProblem(problem, self.passive, state[size:], self.scales[size:], ends_on_event=False)
-
-
-def _recorded(change: Change) -> TransitionPath:
-    """The beginning of a slip, if there is one."""
-    ends = jnp.where(change.rolls | change.lost, jnp.inf, change.elapsed)
-    motions = jax.tree.map(lambda leaf: leaf[None], (change.onset, change.wait))
-    return TransitionPath(ends[None], motions, jnp.ones((1, len(ends)), int))
 
 
 def kinds_of(stick_slip: StickSlip, tolerance: float) -> tuple[ContactMode, ContactMode]:

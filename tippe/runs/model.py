@@ -62,24 +62,19 @@ class RunKind(NamedTuple):
     loss: Callable[..., Int[Array, " cells"]] | None
     flight_state: bool = False
 
-    @property
-    def smooth(self) -> bool:
-        """Whether a run is one smooth motion."""
-        return self.modes is None
-
 
 #: Descriptions of the counters of a run.
 COUNTED = {"hops": "flights", "sticks": "changes from slip to rolling"}
 
 
-def loss_of_contact(scene: Scene, state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
-    """How a contact has ended, as a code in `LOSSES`."""
-    return scene.dynamics.loss(state)
-
-
 # The state of one smooth motion has one energy.
-SMOOTH = RunKind((), None, lambda scene, state, mode: (scene.energy(state),) * 2, loss_of_contact)
-STICK_SLIP = RunKind(("sticks",), stick_slip_modes, contact_energy, loss_of_contact)
+SMOOTH = RunKind(
+    (),
+    None,
+    energy_in=lambda scene, state, mode: (scene.energy(state),) * 2,
+    loss=lambda scene, state: scene.dynamics.loss(state),
+)
+STICK_SLIP = SMOOTH._replace(counts=("sticks",), modes=stick_slip_modes, energy_in=contact_energy)
 HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
 AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
 STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
@@ -114,14 +109,14 @@ def _start_of_flights(scene: Scene[Top], launch: Launch, cells: int) -> Inversio
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state, scales)
 
 
-def why_unresolved(kind: RunKind) -> str:
-    """The reasons why a run of this kind may be unresolved."""
+def why_unresolved(smooth: bool) -> str:
+    """The reasons why a run may be unresolved, of one smooth motion or of several modes."""
     grown = (
         "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
         "it, or the arena's heights do not fit its normals"
     )
     reasons = "the model does not determine the motion from there on, or the mode changed too often, or"
-    return grown if kind.smooth else f"{reasons} {grown}; tippe.simulate states which"
+    return grown if smooth else f"{reasons} {grown}; tippe.simulate states which"
 
 
 # The top as a model.
@@ -229,7 +224,7 @@ class TopModel(AbstractSceneModel):
 
     @property
     def smooth(self) -> bool:
-        return self.kind.smooth
+        return self.kind.modes is None
 
     @property
     def fit_slopes(self) -> str:

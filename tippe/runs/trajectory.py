@@ -278,20 +278,17 @@ class HybridTrajectory(AbstractTrajectory):
         return f"turned over: the stem first carries it at {self.stem_time:.6g} s{again}"
 
     @property
-    def _flights(self) -> int:
-        return 0 if self.hops is None else len(self.hops)
-
-    @property
     def where_the_model_ends(self) -> str:
         """The reason why the motion is undetermined after the end of the run."""
         return "sphere and stem touch the plane together, and friction is so strong that the forces are not determined"
 
     def _reason(self) -> str:
         """The reason for the status "unresolved"."""
+        assert self.hops is not None
         contacts = sum(segment.number != BETWEEN for segment in self.dense.segments)
         if self.dense.status != UNRESOLVED:
             return why_unbalanced(self)
-        if self._flights >= MOST_BOUNCES or contacts >= MOST_ROUNDS:
+        if len(self.hops) >= MOST_BOUNCES or contacts >= MOST_ROUNDS:
             return "there were too many flights or changes of contact"
         return self.where_the_model_ends
 
@@ -301,7 +298,8 @@ class HybridTrajectory(AbstractTrajectory):
         if "impact_loss" not in self.stats:
             hops = self.stats.get("hops")
             return text if hops is None or is_traced(hops) or np.ndim(hops) else f"{text}\n  {int(hops)} flights"
-        text = f"{text}\n  {self._flights} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
+        assert self.hops is not None
+        text = f"{text}\n  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
         return f"{text}\n  unresolved: {self._reason()}" if self.status == Status.UNRESOLVED.word else text
 
 

@@ -280,7 +280,7 @@ def event_table(
     if model.smooth and isinstance(table.variables, dict):
         unresolved = np.asarray(table.variables["status"] == "unresolved")
         if unresolved.any():
-            warn(f"{unresolved.sum()} of {unresolved.size} runs are unresolved: {why_unresolved(model.kind)}")
+            warn(f"{unresolved.sum()} of {unresolved.size} runs are unresolved: {why_unresolved(smooth=True)}")
     return table
 
 
@@ -549,7 +549,7 @@ def first_or_last_time(model: TopModel, t1: Number, crossing: str, settings: Set
     word = form.words[cell["status"]]
     if word == "failed" and cell["steps"] >= settings.max_steps:
         raise ValueError(too_many_steps(t1, settings.max_steps, cell["end_time"]))
-    reason = f": {why_unresolved(model.kind)}" if word == "unresolved" else ""
+    reason = f": {why_unresolved(model.smooth)}" if word == "unresolved" else ""
     end = f"at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad"
     warn(f"the {form.event} time is NaN: the run ended as {word!r} {end}{reason}")
     return time
