@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import (
     AbstractSurface,
     Component,
+    Plane,
     Vector,
     add,
     cross,
@@ -267,8 +268,10 @@ class Dynamics(eqx.Module):
         """Side forces [N] of the ground on the rear axle and on the front wheel, to the left of each.
 
         From the balance of momentum across the heading and of spin about the normal (`stroller.md`, section 4), solved
-        without dividing by cos(phi). They hold for the intrinsic heading.
+        without dividing by cos(phi).
         """
+        if self.heading.projected and not isinstance(self.surface, Plane):
+            return self._projected_side_force(t, state, controls)
         body = self.body
 
         def speeds(state):
@@ -300,7 +303,7 @@ class Dynamics(eqx.Module):
         )
         return lateral_force - front * g.cosine, front
 
-    def projected_side_force(
+    def _projected_side_force(
         self, t: Float[Array, "..."], state: State, controls: Input | None
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Side forces [N] like `side_force`, for the projected heading on curved ground: they act horizontally.

@@ -1,6 +1,6 @@
 """The scene, vehicle, ground, friction and gravity, and its rides as problems."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
@@ -44,17 +44,6 @@ RIGHT_ANGLE = 1e-9
 
 #: A condition, in JAX for traced numbers.
 Condition: TypeAlias = Bool[Array | np.ndarray, "..."] | np.bool_ | bool
-
-
-def require_word(word: object, name: str, words: Iterable[str]) -> None:
-    """Raise `ValueError` unless `word` is one of the allowed words."""
-    if word not in tuple(words):
-        raise ValueError(f"{name} = {shown(word)} must be one of {', '.join(map(repr, words))}")
-
-
-def _holds_somewhere(condition: Condition) -> bool:
-    """Whether a concrete condition holds anywhere; false for a traced one."""
-    return not is_traced(condition) and bool(np.any(condition))
 
 
 class Scene(Bounded):
@@ -112,8 +101,9 @@ class Scene(Bounded):
         require_kind(self.body, "body", Stroller)
         require_kind(self.surface, "surface", AbstractSurface, ", such as stroller.Plane() or stroller.Sphere(10.0)")
         require_kind(self.friction, "friction", AbstractFriction, " law, such as stroller.Damping(rolling=2.0)")
-        require_word(self.fork, "fork", FORKS)
-        require_word(self.heading, "heading", HEADINGS)
+        for name, words in (("fork", tuple(FORKS)), ("heading", HEADINGS)):
+            if (word := getattr(self, name)) not in words:
+                raise ValueError(f"{name} = {shown(word)} must be one of {', '.join(map(repr, words))}")
         self.surface.sign(self.side, DRIVES)
         if not isinstance(self.surface, Plane) and self.body.centre is not None:
             raise ValueError(
@@ -154,12 +144,12 @@ class Scene(Bounded):
         """Raise `ValueError` if the scene cannot start with the launch."""
         require_kind(launch, "launch", Launch)
         require_all(self.surface.place_bounds(launch.place, self.body.wheelbase))
-        if _holds_somewhere(self.sideways(launch)):
+        if not is_traced(stuck := self.sideways(launch)) and np.any(stuck):
             raise ValueError(
                 f"steering = {shown(launch.steering)} must differ from a right angle for speed = {shown(launch.speed)}: "
                 "the rear axle cannot move while the front wheel is at a right angle"
             )
-        if _holds_somewhere(self.level(launch)):
+        if not is_traced(on_equator := self.level(launch)) and np.any(on_equator):
             raise ValueError(
                 f"place[1] = {shown(launch.place[1])} must differ from 0 for heading = 'projected': on the equator, motion "
                 "along the ground has no horizontal speed, and the constraints may lose rank"

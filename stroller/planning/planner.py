@@ -79,13 +79,6 @@ def obstacles_seen(task: Task, pose: Pose) -> tuple[Float[Array, "obstacles 8"],
     return seen.reshape(len(seen), CORNERS), jnp.abs(corners[:, 0, 0]) < 0.1 * FAR
 
 
-def numbers_seen(task: Task) -> int:
-    """How many numbers a decision depends on: the goal, the time left and four constants, the latest coefficients, the
-    number of the proposal, the pose where places differ from each other, and what is seen of all obstacles."""
-    pose = 0 if isinstance(task.dynamics.surface, Plane) else len(task.start[0])
-    return 6 + 1 + 4 + 2 * (ORDER - 1) + PROPOSALS + pose + 2 * SEEING
-
-
 class Planner(eqx.Module):
     """A network that proposes drives for problems like those on which it was trained. `learn_planner` returns it, and `plan`
     tries its best proposal first.
@@ -123,12 +116,16 @@ class Planner(eqx.Module):
     @classmethod
     def untrained(cls, task: Task, key: Key[Array, ""]) -> "Planner":
         """A planner with random weights for problems such as one."""
+        # A decision depends on the goal, the time left and four constants, the latest coefficients, the number of the
+        # proposal, the pose where places differ from each other, and what is seen of all obstacles.
+        pose = 0 if isinstance(task.dynamics.surface, Plane) else len(task.start[0])
+        seen = 6 + 1 + 4 + 2 * (ORDER - 1) + PROPOSALS + pose + 2 * SEEING
         first, second = jax.random.split(key)
         # Single precision is enough for a proposal, and faster.
         options = {"activation": jax.nn.silu, "dtype": jnp.float32}
         return cls(
             eqx.nn.MLP(CORNERS, SEEING, SEEING, 2, key=first, **options),
-            eqx.nn.MLP(numbers_seen(task), 2, DECIDING, 2, key=second, **options),
+            eqx.nn.MLP(seen, 2, DECIDING, 2, key=second, **options),
             float(task.dynamics.body.wheelbase),
             type(task.dynamics.surface).__name__,
         )

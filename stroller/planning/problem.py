@@ -529,13 +529,10 @@ class Problem(eqx.Module):
         """The obstacles as arrays."""
         return Obstacles.of(self.obstacles)
 
-    def corners(self, pose: Pose) -> Float[np.ndarray, "4 2"]:
-        """The corners [m] of the footprint at a pose, seen from above."""
-        return np.asarray(self.footprint.corners(*seen_from_above(self.scene.dynamics, pose)))
-
     def gaps(self, pose: Pose) -> Float[np.ndarray, " obstacles"]:
         """The distance [m] of the footprint at a pose from every obstacle, negative for an overlap."""
-        return np.array([obstacle.distance(self.corners(pose)) for obstacle in self.obstacles])
+        corners = np.asarray(self.footprint.corners(*seen_from_above(self.scene.dynamics, pose)))
+        return np.array([obstacle.distance(corners) for obstacle in self.obstacles])
 
     def gaps_at_goal(self) -> Float[np.ndarray, " obstacles"]:
         """The distance [m] from every obstacle at the goal; at the best of all headings if the goal has none."""

@@ -64,7 +64,7 @@ class RideState:
 
     @functools.cached_property
     def side_force(self) -> Float[Array, "... 2"]:
-        return self.vector(side_force(self.scene, self.t, self.states, self.controls))
+        return self.vector(self.scene.dynamics.side_force(self.t, self.states, self.controls))
 
     def number(self, component: Component) -> Float[Array, "..."]:
         """A component as an array, with zeros if it vanishes identically."""
@@ -164,15 +164,6 @@ def side_slip(ride: RideState) -> tuple[Component, Component]:
     sideways = sum_vectors(scale(-g.sine, heading), scale(g.cosine, left))
     front = sum_vectors(velocity, scale(multiply(scene.body.wheelbase, dot(heading_rate, left)), left))
     return dot(velocity, left), dot(front, sideways)
-
-
-def side_force(
-    scene: Scene, t: Float[Array, "..."], states: State, controls: Input | None
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Side forces [N] on the rear axle and the front wheel, to the left of each."""
-    if scene.heading == "intrinsic" or isinstance(scene.surface, Plane):
-        return scene.dynamics.side_force(t, states, controls)
-    return scene.dynamics.projected_side_force(t, states, controls)
 
 
 def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: Sequence[str] = ()) -> Table:

@@ -140,6 +140,8 @@ class Posture(NamedTuple):
 
 def show(run: Trajectory, number: int, name: str) -> views.Show:
     """The drawing of one ride, the `number`-th of all."""
+    from scipy.integrate import cumulative_trapezoid
+
     scene = run.model.scene
     length, colour = float(scene.body.wheelbase), views.COLOURS[number % len(views.COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
@@ -147,7 +149,7 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
     normal = reader(normals(np, scene.surface, scene.side, np.asarray(run.position)))
     yaw = half * np.asarray(run.yaw_rate)
     speeds = (np.asarray(run.speed) - yaw, np.asarray(run.speed) + yaw, np.asarray(run.front_speed))
-    angles = [reader(_integral(np.asarray(run.t), speed / radius)) for speed in speeds]
+    angles = [reader(cumulative_trapezoid(speed / radius, np.asarray(run.t), initial=0.0)) for speed in speeds]
     drawn = (reader(run.position), reader(run.direction), normal, reader(run.steering))
     posture = Posture.of(np, length, *drawn, angles)
     wheel_mesh = views.wheel(radius, WIDTH * length, (views.DARK, views.PALE))
@@ -225,11 +227,6 @@ def vehicle(length: float, colour: int) -> tuple[views.Mesh, ...]:
         *posts,
         views.bar(handle[0], handle[1], 1.3 * thickness, views.DARK),
     )
-
-
-def _integral(times: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Integral over time, by the trapezoidal rule."""
-    return np.concatenate([[0.0], np.cumsum(np.diff(times) * (rate[1:] + rate[:-1]) / 2.0)])
 
 
 # A page with sliders that simulates a ride in the browser.

@@ -12,7 +12,6 @@ from stroller_chart import Chart, coordinates, coordinates_and_rates
 import stroller
 from nonholonomic.systems.mechanics import Hamel
 from stroller import Damping, Frictionless, Launch, Plane, RollingResistance, Scene, Spheroid, Stroller
-from stroller.runs.trajectory import side_force
 
 FORMULATIONS = (Multipliers, Hamel, ConstrainedConnection, ReducedBracket)
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05, steering_spring=0.3)
@@ -74,7 +73,7 @@ def disagreements(scene, push, states):
         )
         errors = [relative(kind(chart).acceleration(t, q, rate), expected) for kind in FORMULATIONS]
         forces = Multipliers(chart).multipliers(t, q, rate)
-        side = relative(jnp.concatenate(side_force(scene, t[None], state[:, None], push)), forces)
+        side = relative(jnp.concatenate(scene.dynamics.side_force(t[None], state[:, None], push)), forces)
         normal = relative(scene.contact(state), chart.normal_force(q, rate))
         energy = relative(scene.energy(state), chart.energy(q, rate))
         slip = jnp.max(jnp.abs(chart.constraints(q) @ rate))
