@@ -17,8 +17,7 @@ import tippe
 from stroller.model.scene import RideProblem
 from tippe.modes.impact import FreeBody, Impact, Skid, approach, balls
 from tippe.modes.problems import InversionProblem, trajectory_problem
-from tippe.modes.sticking import contact_modes
-from tippe.runs.model import flight_modes, run_kind_of
+from tippe.runs.model import TopModel, run_kind_of
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
 SLOW = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1"}
@@ -67,7 +66,7 @@ def slow_in_problem(problem):
 def table_problems(scene, launch):
     """The problems that a table of the scene integrates: one, or that of every mode."""
     problem, driver = InversionProblem.of(scene, launch, 3.0, 1), run_kind_of(scene)
-    if driver.smooth:
+    if driver.modes is None:
         return (problem,)
     modes, _ = driver.modes(scene, problem, 1e-9, True)
     return tuple(mode.problem(problem.states) for mode in modes)
@@ -75,13 +74,10 @@ def table_problems(scene, launch):
 
 def trajectory_problems(scene, launch):
     """The problems that `simulate` integrates, with all that rides along: one, or that of every mode."""
-    if scene.contact == "hybrid":
-        modes, _, state = flight_modes(scene, launch, 1e-9)
-    else:
-        run = trajectory_problem((scene, launch))
-        if not scene.friction.set_valued:
-            return (run,)
-        modes, _, state = contact_modes(run, 1e-9)
+    model = TopModel(scene=scene, launch=launch)
+    if model.smooth:
+        return (trajectory_problem((scene, launch)),)
+    modes, _, state = model.modes(1, 1e-9, None, False)
     return tuple(mode.problem(state) for mode in modes)
 
 

@@ -13,7 +13,7 @@ import tippe
 from nonholonomic.hybrid import solve_hybrid_dense
 from nonholonomic.integration import Settings
 from tippe.modes.airborne import FLYING, SLIDING
-from tippe.runs.model import flight_modes
+from tippe.runs.model import TopModel
 
 REFERENCE = recorded()
 
@@ -73,7 +73,7 @@ def test_bounces_in_a_bowl():
 def test_a_ball_comes_to_rest():
     """Dropped at the lowest point of a bowl: all bounces together take sqrt(2 h / g) (1 + e) / (1 - e), to 1e-11 s."""
     scene, h, e = hop_scene(CASES[0], tippe.Paraboloid(CASES[0].p1)), 0.01, RESTITUTION
-    batched_modes, *_ = flight_modes(scene, tippe.Launch(0.0, 0.0), 1e-12)
+    batched_modes, *_ = TopModel(scene=scene, launch=tippe.Launch(0.0, 0.0)).modes(1, 1e-12, None, False)
     upright = (0.0, 0.0, 1.0)
     centre = (0.0, 0.0, h + CASES[0].radius - CASES[0].offset)
     state = jnp.array([*centre, *np.zeros(3), *upright, *np.zeros(5), 1.0, *np.zeros(4)])

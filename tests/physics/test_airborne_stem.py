@@ -18,7 +18,7 @@ from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
 import tippe
 from nonholonomic.hybrid.ensemble import program_groups
 from tippe.modes.airborne import ON_STEM, STRIKING, Fly
-from tippe.runs.model import flight_modes
+from tippe.runs.model import TopModel
 
 REFERENCE = recorded()
 STEM = tippe.Stem(radius=5e-3, offset=0.016)
@@ -97,7 +97,8 @@ def test_a_top_that_leans_ends_as_unresolved():
 
 def test_both_spheres_share_their_programs_in_a_batch():
     """Sliding on either sphere, and flying and striking, differ in the values of their arrays only."""
-    modes, _, _ = flight_modes(stem_scene(tippe.Cylinder(0.3), 0.3), tippe.Launch(0.1, 180.0), jnp.asarray(1e-9))
+    model = TopModel(scene=stem_scene(tippe.Cylinder(0.3), 0.3), launch=tippe.Launch(0.1, 180.0))
+    modes, _, _ = model.modes(1, jnp.asarray(1e-9), None, False)
     assert program_groups(modes) == [(0, 2), (1, 3)]
 
 

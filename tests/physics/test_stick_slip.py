@@ -1,7 +1,6 @@
 """Coulomb friction as it stands: Cohen's top, stick and slip, the limit of the regularised law (tippe.md, section 7)."""
 
 import coulomb_top
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,8 +11,8 @@ from tops import homogeneous_ball, rutstam_top
 import tippe
 from nonholonomic.hybrid import HybridPath, solve_hybrid_dense
 from nonholonomic.integration import Settings
-from tippe.modes.problems import trajectory_problem
-from tippe.modes.sticking import ROLLING, contact_modes
+from tippe.modes.sticking import ROLLING, SLIPPING
+from tippe.runs.model import TopModel
 
 
 def cohen_top() -> tippe.Top:
@@ -81,10 +80,9 @@ def test_a_top_that_sticks_and_slips_again():
 def test_a_bowling_ball_slides_and_then_rolls():
     """v = v0 - mu g t until t* = 2 v0 / (7 mu g), then 5 v0 / 7 (row 2), with no error of a slip speed."""
     scene, end = scene_of(homogeneous_ball(), 0.3), 2.0 / (7.0 * 0.3 * 9.81)
-    run = trajectory_problem((scene, tippe.Launch(theta=0.7, spin=0.0)))
-    run = eqx.tree_at(lambda run: run.problem.states, run, run.problem.states.at[0].set(1.0))
-    modes, first, state = contact_modes(run, 1e-11)
-    path = solve_hybrid_dense(modes, int(first[0]), state[:, 0], 3.0 * end, Settings(1e-11), counters=1)
+    modes, _, state = TopModel(scene=scene, launch=tippe.Launch(theta=0.7, spin=0.0)).modes(1, 1e-11, None, False)
+    state = state.at[0].set(1.0)[:, 0]
+    path = solve_hybrid_dense(modes, SLIPPING, state, 3.0 * end, Settings(1e-11), counters=1)
     assert kinds(path) == [False, True]
     assert_close(path.mode_segments[0].end, end, atol=1e-7)
     times = np.array([0.3, 0.9, 0.999, 1.5, 3.0]) * end

@@ -313,7 +313,7 @@ class ArenaSlide(AbstractFlyingMode):
         if other_ball is not None:
             spheres = {"contact_ball": contact_ball, "other_ball": other_ball, "on_stem": self.number == 1}
             problem = OneOfTwo(*contact, flies=True, stem_counts=self.stem_counts, scene=self.scene, **spheres)
-        return self.extended(problem, Quadratures(self.scene.body.I3), state)
+        return self.extended(problem, Quadratures.of(self.scene.body), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         contact_ball, other_ball = own_and_other(self.scene.body, self.number)

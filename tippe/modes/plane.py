@@ -443,7 +443,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         if other_ball is not None:
             spheres = {"contact_ball": contact_ball, "other_ball": other_ball, "on_stem": self.number == 1}
             problem = SlidingOnOne(*contact, flies=True, stem_counts=self.stem_counts, **spheres)
-        return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
+        return self.extended(problem, Quadratures.of(self.scene.body, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         contact_ball, _ = own_and_other(self.scene.body, self.number)
@@ -543,7 +543,7 @@ class Lean(AbstractFlyingMode):
         # that event has not.
         on_stem = jnp.asarray(not self.last)
         problem = InversionProblem(*contact, stem_counts=self.stem_counts, on_stem=on_stem, flies=True)
-        return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
+        return self.extended(problem, Quadratures.of(self.scene.body, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         return shown(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])

@@ -11,7 +11,7 @@ from nonholonomic.geometry import Component, Tangent, Vector, cross, dot, rate_i
 from nonholonomic.hybrid import AbstractBatchedMode
 from nonholonomic.integration import AbstractPassive, AbstractProblem, Components, ExtendedProblem, Lanes, States
 
-from ..model.body import Top
+from ..model.body import AbstractBody, Top
 from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Dynamics, parts
 from ..model.rigid import AbstractRigidBody, AbstractRigidDynamics
 from ..model.scene import Launch, Scene
@@ -102,9 +102,6 @@ def _inversion_problem(
 
 # Motion on one smooth contact with the path on the arena, the orientation about the axis and the work of friction.
 
-#: Launches with their passive quadratures, without an event.
-TrajectoryProblem = ExtendedProblem[InversionProblem]
-
 #: Number of the passive quadratures after the path.
 BEHIND_PATH = 5
 
@@ -121,6 +118,12 @@ class Quadratures(AbstractPassive):
 
     axial: Float[Array, "..."]
     of_mass: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def of(cls, body: AbstractBody | AbstractRigidBody, of_mass: bool = False) -> "Quadratures":
+        """The quadratures of a body."""
+        # The equations of a rigid body return the spin in place of the angular momentum about the axis.
+        return cls(jnp.ones(()) if isinstance(body, AbstractRigidBody) else body.I3, of_mass)
 
     def rates(
         self,
@@ -148,7 +151,7 @@ def c_rate(c: Vector, axis: Vector, axial_rate: Component, frame_rate: Tangent =
 
 
 @compiled_setup
-def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) -> TrajectoryProblem:
+def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) -> ExtendedProblem[InversionProblem]:
     """The run of one launch, or the runs of several cells; numbers are scalars or arrays with one number per cell."""
     scene, launch = modules
     size, weight = scene.body.size, scene.body.mass * scene.gravity
@@ -161,10 +164,8 @@ def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) 
     rows = (scene.state(launch), scene.scales(launch), values, scales)
     if cells is not None:
         rows = tuple(jnp.broadcast_to(row.reshape(len(row), -1), (len(row), cells)) for row in rows)
-    # The equations of a rigid body return the spin in place of the angular momentum about the axis.
-    axial = jnp.ones(()) if isinstance(scene.body, AbstractRigidBody) else scene.body.I3
     problem = InversionProblem(scene.dynamics, None, rows[0], rows[1])
-    return ExtendedProblem(problem, Quadratures(axial), rows[2], rows[3], ends_on_event=False)
+    return ExtendedProblem(problem, Quadratures.of(scene.body), rows[2], rows[3], ends_on_event=False)
 
 
 # Common base of all modes of runs with flights.

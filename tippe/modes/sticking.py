@@ -13,7 +13,8 @@ from nonholonomic.integration import AbstractProblem, ExtendedProblem, Lanes, St
 from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, parts
+from ..model.dynamics import COS_THETA, PLACE, AbstractDynamics, parts
+from ..model.rigid import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.stick_slip import ContactMode, Onset, StickSlip
 from .airborne import (
@@ -30,7 +31,7 @@ from .airborne import (
     standing,
 )
 from .impact import balls, gap_rate
-from .problems import InversionProblem, Quadratures, TrajectoryProblem
+from .problems import InversionProblem, Quadratures
 
 # Runs with stick and slip: the cells of a table, and a single run with its path.
 
@@ -138,46 +139,22 @@ def kinds_of(stick_slip: StickSlip, tolerance: float) -> tuple[ContactMode, Cont
 
 
 def stick_slip_modes(
-    scene: Scene[Top] | None,
-    problem: InversionProblem,
-    tolerance: float,
-    last: bool,
-    passive: Quadratures | None = None,
-    size: int | None = None,
+    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, and the index of the mode in which each starts.
-
-    **Arguments:**
-
-    - `problem`: the problem of launches in a scene with `SetValuedCoulomb`.
-    - `tolerance`: relative tolerance of the integration; `last`: whether the last crossing counts.
-    - `passive`, `size`: as for `StickSlipMode`; by default without quadratures.
-    """
-    stick_slip, size = problem.dynamics, len(problem.states) if size is None else size
+    """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `hopping_modes`."""
+    stick_slip, passive = problem.dynamics, Quadratures.of(scene.body) if with_quadratures else None
     assert isinstance(stick_slip, StickSlip)
+    x_axis = 3 * isinstance(scene.body, AbstractRigidBody)
+    size = PLACE.start + len(stick_slip.frame.place_scales(scene.body.size)) + x_axis
     options = (problem.cos_angle, problem.scales, last, size, passive, problem.spin)
     both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds_of(stick_slip, tolerance))
-    return both_modes, _first_mode(stick_slip, problem.states)
+    return both_modes, _first_mode(stick_slip, problem.states, size)
 
 
 @compiled_setup
-def _first_mode(stick_slip: StickSlip, states: States) -> Int[Array, " cells"]:
+def _first_mode(stick_slip: StickSlip, states: States, size: int) -> Int[Array, " cells"]:
     """The index of the mode in which each cell starts."""
-    return jnp.where(stick_slip.rests(states), ROLLING, SLIPPING)
-
-
-def contact_modes(
-    run: TrajectoryProblem, tolerance: float
-) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], States]:
-    """The modes of runs whose path is kept, the index of each first mode, and the initial states.
-
-    **Arguments:** `run`: one run, or the runs of some cells, in a scene with `SetValuedCoulomb`; `tolerance`: relative
-    tolerance of the integration.
-    """
-    state, scales = (values if values.ndim == 2 else values[:, None] for values in run.start())
-    problem = InversionProblem(run.problem.dynamics, jnp.asarray(NO_COSINE), state[: run.leading], scales)
-    assert isinstance(run.passive, Quadratures)
-    return (*stick_slip_modes(None, problem, tolerance, False, run.passive, run.leading), state)
+    return jnp.where(stick_slip.rests(states[:size]), ROLLING, SLIPPING)
 
 
 # Slipping, rolling and flying over any arena, the level plane included, under set-valued Coulomb friction.
@@ -230,7 +207,7 @@ def airborne_stick_slip_modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `hopping_modes`."""
-    stick_slip, passive = problem.dynamics, Quadratures(scene.body.I3) if with_quadratures else None
+    stick_slip, passive = problem.dynamics, Quadratures.of(scene.body) if with_quadratures else None
     assert isinstance(stick_slip, StickSlip)
     options = (problem.cos_angle, problem.scales, last, OWN, passive)
     slips, rolls = (Touch(kind, *options, scene=scene) for kind in kinds_of(stick_slip, tolerance))

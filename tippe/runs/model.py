@@ -23,7 +23,6 @@ from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
 
 from ..friction import NoSlip
-from ..model.body import Top
 from ..model.dynamics import LOSSES, NO_COSINE
 from ..model.scene import Launch, Scene, generic_direction
 from ..modes.airborne import airborne_modes
@@ -35,7 +34,6 @@ from ..modes.sticking import (
     airborne_energy,
     airborne_stick_slip_modes,
     contact_energy,
-    contact_modes,
     loss,
     stick_slip_modes,
 )
@@ -90,19 +88,11 @@ def run_kind_of(scene: Scene) -> RunKind:
     return HYBRID if scene.flies_in_closed_form else AIRBORNE
 
 
-def flight_modes(scene: Scene[Top], launch: Launch, tolerance: Number, cells: int = 1) -> Start:
-    """The modes of launches of a hybrid scene, with their path, rotation and work; the index of each first mode; and the
-    initial states."""
-    problem, modes = _start_of_flights(scene, launch, cells), run_kind_of(scene).modes
-    assert modes is not None
-    return (*modes(scene, problem, tolerance, last=False, with_quadratures=True), problem.states)
-
-
 @compiled_setup
-def _start_of_flights(scene: Scene[Top], launch: Launch, cells: int) -> InversionProblem:
-    """The launches, with the passive quadratures."""
+def _start_with_path(scene: Scene, launch: Launch, cells: int) -> InversionProblem:
+    """The launches of runs of several modes, with the passive quadratures: path, rotation and work."""
     state, scales = trajectory_problem((scene, launch), cells).start()
-    if scene.flies_in_closed_form:
+    if scene.contact == "hybrid" and scene.flies_in_closed_form:
         # The path is that of the centre of mass.
         place = state[8:10] - scene.body.offset * state[2:4]
         state = jnp.concatenate([state[:8], place, state[10:]])
@@ -286,14 +276,13 @@ class TopModel(AbstractSceneModel):
         return CoreProblem(run, len(run.start()[0]) - BEHIND_PATH if has_path else run.leading)
 
     def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
-        scene, launch = self.scene, self.launch
+        assert self.kind.modes is not None
         if self._is_without_path(names):
-            assert self.kind.modes is not None
             problem = self._problem_without_path(cells, names)
-            return (*self.kind.modes(scene, problem, tolerance, continues), problem.states)
-        if scene.contact == "stop":
-            return contact_modes(trajectory_problem((scene, launch), cells), tolerance)
-        return flight_modes(scene, launch, tolerance, cells)
+            return (*self.kind.modes(self.scene, problem, tolerance, continues), problem.states)
+        problem = _start_with_path(self.scene, self.launch, cells)
+        modes = self.kind.modes(self.scene, problem, tolerance, last=False, with_quadratures=True)
+        return (*modes, problem.states)
 
     @property
     def quantities(self) -> dict[str, Quantity]:
