@@ -152,9 +152,10 @@ class AbstractProblem(eqx.Module):
     def field(self, time: Lanes, state: Components) -> States:
         """Rate of change of the state, lane by lane; the state may come as a tuple of its components."""
 
-    @abc.abstractmethod
     def event_function(self, state: States) -> Lanes | None:
-        """A smooth function of order 1, positive before the event, negative after it; `None` if there is no event."""
+        """A smooth function of order 1, positive before the event, negative after it; `None`, the default, if there is no
+        event."""
+        return None
 
     def crossing_along(self, state: States, rate: States) -> Lanes | None:
         """The event function of a state whose rate is known: equal to `event_function`, for problems where the rate

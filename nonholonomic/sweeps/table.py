@@ -523,10 +523,8 @@ class Tabular(abc.ABC):
     #: The quantities that `run[name]` returns.
     quantities: ClassVar[Mapping[str, Quantity]] = MappingProxyType({})
 
-    @property
-    @abc.abstractmethod
-    def portrait_axes(self) -> tuple[str, str]:
-        """The variables that `portrait` draws by default."""
+    #: The variables that `portrait` draws by default, which every run has.
+    portrait_axes: ClassVar[tuple[str, str]]
 
     @abc.abstractmethod
     def to_table(self) -> Table:

@@ -17,7 +17,7 @@ from nonholonomic.integration.problem import Status, require_run
 from nonholonomic.parameters import description, numbers, numbers_of
 from nonholonomic.runs.event import EventFunction, with_clock, with_event
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, run_of, statuses
-from nonholonomic.sweeps import Quantity, Variable
+from nonholonomic.sweeps import Variable
 from nonholonomic.text import name_of
 from nonholonomic.validation import require_kind, require_scalars
 
@@ -86,9 +86,11 @@ class RideModel(AbstractSceneModel):
     original: "Original | None" = eqx.field(static=True, default=None)
     jumps: tuple[Array, ...] = ()
 
-    continues = True
+    smooth, continues = True, True
     # Nothing is watched.
     comparable = ("speed",)
+    words = ("completed", "contact_lost", "rank_lost", "failed", "event")
+    quantities, ends = QUANTITIES, ENDS
 
     @classmethod
     def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None, jumps: object = None) -> AbstractModel:
@@ -151,14 +153,6 @@ class RideModel(AbstractSceneModel):
     def legal(self) -> Bool[Array, "..."]:
         return self.scene.may_start(self.launch, self.input)
 
-    @property
-    def smooth(self) -> bool:
-        return True
-
-    @property
-    def words(self) -> tuple[str, ...]:
-        return ("completed", "contact_lost", "rank_lost", "failed", "event")
-
     def for_lanes(self) -> tuple["RideModel", bool]:
         if not isinstance(self.input, Formula | Held) or has_arrays((self.scene, self.launch)):
             return self, isinstance(self.input, PerRide)
@@ -183,10 +177,6 @@ class RideModel(AbstractSceneModel):
         return dataclasses.replace(self, event=None)
 
     @property
-    def quantities(self) -> dict[str, Quantity]:
-        return QUANTITIES
-
-    @property
     def components(self) -> dict[str, tuple[str, ...]]:
         return VECTORS | {"coordinate": tuple(name for name, _ in self.scene.surface.coordinates)}
 
@@ -204,10 +194,6 @@ class RideModel(AbstractSceneModel):
             return status
         lost = jnp.isfinite(outcome.crossing_time) & (status == int(Status.COMPLETED))
         return jnp.where(lost, int(Status.EVENT), status)
-
-    @property
-    def ends(self) -> dict[str, Variable]:
-        return ENDS
 
     def at_end(self, outcome: Outcome | HybridOutcome, start: Float[Array, "components cells"]) -> dict[str, Array]:
         scene, surface = self.scene, self.scene.surface

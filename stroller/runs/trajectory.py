@@ -385,6 +385,7 @@ class Trajectory(AbstractRun):
 
     readable: ClassVar[tuple[str, ...]] = tuple(QUANTITIES)
     quantities: ClassVar[dict[str, Quantity]] = QUANTITIES
+    portrait_axes = ("steering", "yaw_rate")
 
     def __getattr__(self, name: str) -> Any:
         # Python calls this only for names that are not attributes, also while a copy has none yet.
@@ -405,10 +406,6 @@ class Trajectory(AbstractRun):
     @property
     def of_page(self) -> tuple[AbstractModel, float]:
         return self.model, float(self.spec.ride.t1)
-
-    @property
-    def portrait_axes(self) -> tuple[str, str]:
-        return "steering", "yaw_rate"
 
     @property
     def energy_residual(self) -> Float[Array, " times"]:

@@ -6,7 +6,7 @@ along n follows from the axis, because the contact persists. Cyclic coordinates 
 """
 
 import abc
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -141,10 +141,8 @@ class AbstractDynamics(eqx.Module):
     """Equations of motion, with the precomputed combinations of a scene's numbers; they hold while all margins are
     positive."""
 
-    @property
-    @abc.abstractmethod
-    def weight(self) -> Float[Array, "..."]:
-        """Weight of the body [N]."""
+    #: Weight of the body [N], a property of every kind.
+    weight: ClassVar[Float[Array, "..."]]
 
     @abc.abstractmethod
     def motion(self, state: Components) -> Any:

@@ -225,20 +225,15 @@ class AbstractRigidBody(Bounded):
     inertia: eqx.AbstractVar[Inertia]
     centre_of_mass: eqx.AbstractVar[tuple[Float[Array, "..."], ...]]
 
-    @property
-    @abc.abstractmethod
-    def size(self) -> Float[Array, "..."]:
-        """A length of the body [m], the unit for places and velocities."""
+    #: A length of the body [m], the unit for places and velocities; and half the least and half the greatest distance
+    #: [m] of parallel planes that touch the body. Every body has these properties.
+    size: ClassVar[Float[Array, "..."]]
+    half_widths: ClassVar[tuple[Float[Array, "..."], Float[Array, "..."]]]
 
     @property
     def moments(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """The magnitudes of the moments of inertia across and along the body's z axis [kg m^2]."""
         return 0.5 * (self.inertia.xx + self.inertia.yy), self.inertia.zz
-
-    @property
-    @abc.abstractmethod
-    def half_widths(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Half the least and half the greatest distance [m] of parallel planes that touch the body."""
 
     @abc.abstractmethod
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:

@@ -262,9 +262,6 @@ class Impact(AbstractProblem):
         rows = [jnp.zeros_like(time) if component is None else component for component in (*load.force, *torque)]
         return jnp.stack(jnp.broadcast_arrays(*rows, time)[:-1])
 
-    def event_function(self, state: Float[Array, "rows cells"]) -> None:
-        return None
-
     def domain_margin(self, time: Lanes, state: Float[Array, "rows cells"]) -> Lanes:
         impulse, response = self.impulse(time, state), self.approach.response
         change, angular_change = self.changes(impulse)
@@ -423,9 +420,6 @@ class Skid(AbstractProblem):
     def field(self, time: Lanes, state: Float[Array, "3 cells"]) -> Float[Array, "3 cells"]:
         v1, v2, _ = self.velocity(state)
         return jnp.stack([-self.mu * v1, -self.mu * v2, length(v1, v2)]) / self.pace
-
-    def event_function(self, state: Float[Array, "3 cells"]) -> None:
-        return None
 
     def domain_margin(self, time: Lanes, state: Float[Array, "3 cells"]) -> Lanes:
         return least(self.impact.domain_margin(state[2], state[:2]), self.slip_left(state))

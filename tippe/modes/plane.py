@@ -532,10 +532,8 @@ class Lean(AbstractFlyingMode):
 
     last: bool = eqx.field(static=True)
 
-    @property
-    def rare(self) -> bool:
-        # Few tops come to rest on both spheres.
-        return True
+    # Few tops come to rest on both spheres.
+    rare = True
 
     def problem(self, state: States) -> AbstractProblem:
         contact = (LeaningDynamics.of(self.scene), self.cos_angle, state[:OWN], self.scales[:OWN])

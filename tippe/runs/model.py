@@ -123,6 +123,9 @@ REVERSALS = TableForm(
     nan_if_failed=False,
 )
 
+#: The numbers of a run's end.
+ENDS = {"end_theta": Variable("rad", np.float64, long_name="θ at the end of the run")}
+
 #: A tilt [rad] that no number shows: a plane with a tilt has the equations for any arena.
 NO_TILT = 1e-300
 
@@ -142,6 +145,8 @@ class TopModel(AbstractSceneModel):
 
     components = COMPONENTS
     comparable = ("direction",)
+    words = ("event", "completed", *WORDS[2:])
+    ends = ENDS
 
     @classmethod
     def of(cls, scene: Scene, launch: Launch, event: Any = None) -> AbstractModel:
@@ -313,10 +318,6 @@ class TopModel(AbstractSceneModel):
             return Trajectory
         return HybridTrajectory if self.scene.flies_in_closed_form else ArenaTrajectory
 
-    @property
-    def words(self) -> tuple[str, ...]:
-        return ("event", "completed", *WORDS[2:])
-
     def ended(self, outcome: Outcome | HybridOutcome, tolerance: Number) -> Int[Array, " cells"]:
         scene, kind = self.scene, self.kind
         cells = outcome.status.shape[0]
@@ -332,10 +333,6 @@ class TopModel(AbstractSceneModel):
         codes = jnp.array([int(status) for status in LOSSES])
         left_domain = Status.JAMMED if kind.loss is None else codes[kind.loss(scene, state)]
         return jnp.where(grown, int(Status.UNRESOLVED), statuses(outcome.status, left_domain))
-
-    @property
-    def ends(self) -> dict[str, Variable]:
-        return {"end_theta": Variable("rad", np.float64, long_name="θ at the end of the run")}
 
     def at_end(self, outcome: Any, start: Float[Array, "components cells"]) -> dict[str, Array]:
         state = jnp.asarray(outcome.state)[: len(start)]

@@ -1,6 +1,5 @@
 """The quantities of a run of a tippe top, in contact or through flights: one state at each time."""
 
-import abc
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self, TypeAlias, TypeVar
@@ -144,27 +143,19 @@ class AbstractTrajectory(AbstractRun):
 
     readable: ClassVar[tuple[str, ...]] = tuple(QUANTITIES)
     quantities: ClassVar[dict[str, Quantity]] = QUANTITIES
+    portrait_axes = ("theta", "theta_rate")
 
-    @property
-    def portrait_axes(self) -> tuple[str, str]:
-        return "theta", "theta_rate"
+    #: Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` if the sphere touches at all times.
+    above: ClassVar[tuple[Component, Component]] = (None, None)
+
+    #: Kinetic and potential energy [J], (times,); a property of every kind of run.
+    energy: ClassVar[Float[Array, " times"]]
 
     def padded(self) -> Self:
         """The run with its last time repeated, up to a power of two, and without fields that observables do not
         need."""
         arrays = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
         return dataclasses.replace(self, **arrays, **(dict.fromkeys(self.unused, None) | {"stats": {}}))
-
-    @property
-    @abc.abstractmethod
-    def above(self) -> tuple[Component, Component]:
-        """Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` if the sphere touches at all
-        times."""
-
-    @property
-    @abc.abstractmethod
-    def energy(self) -> Float[Array, " times"]:
-        """Kinetic and potential energy [J]."""
 
     @classmethod
     def parts_of(cls, scene: Scene, rows: Values, mode: Values | None, core: int) -> dict[str, Any]:

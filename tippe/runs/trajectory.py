@@ -1,7 +1,7 @@
 """One run of a tippe top, with its path, in contact or through flights."""
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -86,11 +86,6 @@ class Trajectory(AbstractTrajectory):
 
     ```
     """
-
-    @property
-    def above(self) -> tuple[None, None]:
-        """`None`: the contact persists, so there is no distance from the arena."""
-        return None, None
 
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
@@ -186,6 +181,11 @@ class HybridTrajectory(AbstractTrajectory):
     contact: Any = None
     hops: Float[np.ndarray, "hops 2"] | None = None
 
+    #: The reason why the motion is undetermined after the end of the run.
+    where_the_model_ends: ClassVar[str] = (
+        "sphere and stem touch the plane together, and friction is so strong that the forces are not determined"
+    )
+
     unused = (*AbstractTrajectory.unused, "hops")
     by_time = (*AbstractTrajectory.by_time, "distance", "contact")
 
@@ -276,11 +276,6 @@ class HybridTrajectory(AbstractTrajectory):
             return super()._whether_it_turned_over
         again = ", and at the end its sphere touches again" if np.asarray(self.contact)[-1] in (0, 2) else ""
         return f"turned over: the stem first carries it at {self.stem_time:.6g} s{again}"
-
-    @property
-    def where_the_model_ends(self) -> str:
-        """The reason why the motion is undetermined after the end of the run."""
-        return "sphere and stem touch the plane together, and friction is so strong that the forces are not determined"
 
     def _reason(self) -> str:
         """The reason for the status "unresolved"."""
