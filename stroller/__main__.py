@@ -13,14 +13,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic import __version__
+from nonholonomic import __version__, views
 from nonholonomic.command_line import run_and_exit
 from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import as_number, replacing, require, require_folder
-from nonholonomic.views import Outputs, Stage, can_draw, page_of_job, picture_as_html, run_job
 
 from .model.input import Motion
 from .model.scene import FORKS, Scene
@@ -194,7 +193,7 @@ def parked(options: argparse.Namespace) -> Plan:
     )
 
 
-def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[Stage]:
+def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[views.Stage]:
     """The stages of the page: the plan, and each ground with its rides."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
     # The plan has the first colour.
@@ -251,7 +250,7 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
     with status_line("drawing"):
         table_of(list(rides.values()), names, request | {"ride": names}).save(options.out / "rides.h5")
         files, pictures = ["rides.h5"], []
-        if can_draw():
+        if views.can_draw():
             grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
             for heading, name, figure in (
                 ("Parking", "parked.png", parking.plot()),
@@ -259,16 +258,16 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
             ):
                 figure.savefig(options.out / name, dpi=110)
                 files.append(name)
-                pictures.append(f"<h2>{heading}</h2>{picture_as_html(options.out / name)}")
+                pictures.append(f"<h2>{heading}</h2>{views.picture_as_html(options.out / name)}")
         plan_text, audit = (f"<pre>{escape(text)}</pre>" for text in (str(parking), "\n".join(audits)))
         sections = "".join([*pictures[:1], plan_text, "<h2>Energy against work</h2>", audit, *pictures[1:]])
-        page = page_of_job(lambda: stages(parking, rides), "A stroller parks, and rides", 1.0, sections)
+        page = views.page_of_job(lambda: stages(parking, rides), "A stroller parks, and rides", 1.0, sections)
         page.save(options.out / PAGE)
     printed = "\n".join([f"Parking: {parking}", "", *audits])
     return {AUDIT: printed.encode()} | {name: (options.out / name).read_bytes() for name in [*files, PAGE]}
 
 
-def write(options: argparse.Namespace) -> Outputs:
+def write(options: argparse.Namespace) -> views.Outputs:
     """Write all files, computed or from an earlier run of the same options, and print the audit."""
     cache = enable_compilation_cache()
     facts = "rides", sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
@@ -282,7 +281,7 @@ def write(options: argparse.Namespace) -> Outputs:
             with replacing(path) as scratch:
                 scratch.write_bytes(files[name])
     page = paths.pop(PAGE)
-    return Outputs(2 * len(scenes(options)), list(paths.values()), page, cache if read else None)
+    return views.Outputs(2 * len(scenes(options)), list(paths.values()), page, cache if read else None)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -293,7 +292,7 @@ def main(arguments: list[str] | None = None) -> int:
     **Returns:** the exit status: 0, or 2 for input that cannot be used.
     """
     options = parser().parse_args(arguments)
-    return run_job(lambda: write(options), "stroller")
+    return views.run_job(lambda: write(options), "stroller")
 
 
 if __name__ == "__main__":

@@ -13,23 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from nonholonomic import __version__
+from nonholonomic import __version__, views
 from nonholonomic.command_line import run_and_exit
 from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.sweeps import AnotherRun, Table, saved_cells
 from nonholonomic.terminal import Progress
 from nonholonomic.validation import replacing, require_folder
-from nonholonomic.views import (
-    Outputs,
-    Page,
-    can_draw,
-    page_of_job,
-    picture_as_html,
-    run_job,
-    table_as_html,
-    without_motion,
-)
 from nonholonomic.views.explore import live_page
 
 from . import paper, presets, steady
@@ -190,7 +180,7 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
         with display:
             display.begin()
             futures = {arena: threads.submit(table, options, arena, cache) for arena in ("cylinder", "plane")}
-            if not without_motion():
+            if not views.without_motion():
                 page_facts, contents = facts(options, "page"), lambda: {"page": sliders(options).encode()}
                 live = threads.submit(kept_files, cache, page_facts, contents)
             for arena in ARENAS:
@@ -199,7 +189,7 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
                     print(report(options, arena, tables[arena]), flush=True)
                 display.advance(1)
                 # Drawn while the threads compile, after the table of the plane, whose programs it uses.
-                if arena == "plane" and can_draw():
+                if arena == "plane" and views.can_draw():
                     pictures.append(options.out / "theta.png")
                     picture(options, *theta_shown(options, cache), tables["plane"]).savefig(pictures[0], dpi=130)
                     display.advance(1)
@@ -262,7 +252,7 @@ def picture(options: argparse.Namespace, times: Times, theta: Times, plane: Tabl
     return draw_launches([panel], angle, dot if end <= times[-1] else f"Not turned over by {times[-1]:g} s.")
 
 
-def write(options: argparse.Namespace) -> Outputs:
+def write(options: argparse.Namespace) -> views.Outputs:
     """Compute and write the tables, the picture and the page: the top with sliders if three.js is installed, the tables, and
     the picture.
 
@@ -287,13 +277,13 @@ def write(options: argparse.Namespace) -> Outputs:
     print(f"\n{claim} {remark(options)}", flush=True)
     sections = ""
     for arena, heading in headings(options).items():
-        rows = table_as_html(rows_of(options, tables[arena]), 1)
+        rows = views.table_as_html(rows_of(options, tables[arena]), 1)
         sections += f"<h2>Time until it has turned over, {heading}</h2>{rows}"
     sections += "".join(f'<p class="note">{escape(line)}</p>' for line in (claim, remark(options), *described(options)))
-    sections += "".join(f"<h2>θ(t)</h2>{picture_as_html(path)}" for path in pictures)
+    sections += "".join(f"<h2>θ(t)</h2>{views.picture_as_html(path)}" for path in pictures)
     path = options.out / "index.html"
-    Page((live or page_of_job(list, TITLE, 1.0, BELOW).html).replace(BELOW, sections)).save(path)
-    return Outputs(turned_over.size, [*paths.values(), *pictures], path, cache if read else None)
+    views.Page((live or views.page_of_job(list, TITLE, 1.0, BELOW).html).replace(BELOW, sections)).save(path)
+    return views.Outputs(turned_over.size, [*paths.values(), *pictures], path, cache if read else None)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -307,7 +297,7 @@ def main(arguments: list[str] | None = None) -> int:
     if "--paper" in arguments:
         return paper.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
-    return run_job(lambda: write(options), "tippe", "To see the top move")
+    return views.run_job(lambda: write(options), "tippe", "To see the top move")
 
 
 if __name__ == "__main__":

@@ -17,14 +17,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from nonholonomic import __version__
+from nonholonomic import __version__, views
 from nonholonomic.compilation.cache import enable_compilation_cache
 from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.sweeps import Table
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import require_folder
-from nonholonomic.views import Outputs, Stage, can_draw, page_of_job, picture_as_html, run_job, table_as_html
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .model.body import Top
@@ -282,7 +281,7 @@ def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
     return draw_launches(panels, options.angle, "Dots: above the dashed angle for good")
 
 
-def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Stage]:
+def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[views.Stage]:
     """In both arenas, the most upright launch that turns over without losing contact, or else the first launch that
     turns over."""
     ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in by_arena.values()]).max(axis=0)
@@ -298,22 +297,22 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Sta
     return stages(groups)
 
 
-def write(options: argparse.Namespace) -> Outputs:
+def write(options: argparse.Namespace) -> views.Outputs:
     """Compute and write the tables, the picture if matplotlib is installed, and the page: two moving tops if three.js is
     installed, the tables, and the picture."""
     by_arena = tables(options)
     print(report(options, by_arena))
     with status_line("drawing"):
         files = [options.out / f"{arena}.h5" for arena in by_arena]
-        sections = "<h2>Inversion times</h2>" + table_as_html(list(map(list, rows_of(options, by_arena))), 2)
+        sections = "<h2>Inversion times</h2>" + views.table_as_html(list(map(list, rows_of(options, by_arena))), 2)
         sections += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
-        if can_draw():
+        if views.can_draw():
             files.append(options.out / "theta.png")
             picture(options, by_arena).savefig(files[-1], dpi=130)
-            sections += "<h2>θ(t) of every launch</h2>" + picture_as_html(files[-1])
+            sections += "<h2>θ(t) of every launch</h2>" + views.picture_as_html(files[-1])
         path = options.out / "index.html"
-        page_of_job(lambda: motions(options, by_arena), "A tippe top turns over", 0.5, sections).save(path)
-    return Outputs(sum(table.status.size for table in by_arena.values()), files, path)
+        views.page_of_job(lambda: motions(options, by_arena), "A tippe top turns over", 0.5, sections).save(path)
+    return views.Outputs(sum(table.status.size for table in by_arena.values()), files, path)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -325,4 +324,4 @@ def main(arguments: list[str] | None = None) -> int:
     """
     options = parser().parse_args(arguments)
     enable_compilation_cache()
-    return run_job(lambda: write(options), "tippe --paper")
+    return views.run_job(lambda: write(options), "tippe --paper")

@@ -17,19 +17,7 @@ from ..model.dynamics import COS_THETA, PLACE, AbstractDynamics, parts
 from ..model.rigid import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.stick_slip import ContactMode, Onset, StickSlip
-from .airborne import (
-    FLYING,
-    ON_STEM,
-    OWN,
-    SLIDING,
-    Fly,
-    below,
-    flight_state,
-    flying_body,
-    in_contact,
-    lift_off,
-    standing,
-)
+from . import airborne
 from .impact import balls, gap_rate
 from .problems import InversionProblem, Quadratures
 
@@ -163,7 +151,7 @@ def _first_mode(stick_slip: StickSlip, states: States, size: int) -> Int[Array, 
 # `airborne.py`.
 
 #: The numbers of the modes; flying has the same number as in `airborne.py`.
-TOUCH_SLIPPING, TOUCH_ROLLING = SLIDING, 2
+TOUCH_SLIPPING, TOUCH_ROLLING = airborne.SLIDING, 2
 
 
 class Touch(StickSlipMode):
@@ -181,26 +169,30 @@ class Touch(StickSlipMode):
         """Stick, slip, or fly where the contact is lost. Counts flights, and changes from slip to rolling."""
         transition = super().reset_map(state, left)
         state_after = self.carried_along(transition.state) if self.kind.rolls else transition.state
-        flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(state_after[:OWN]) == 0)
+        flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(state_after[: airborne.OWN]) == 0)
         mode = jnp.where(transition.mode == ROLLING, TOUCH_ROLLING, TOUCH_SLIPPING)
         return transition._replace(
-            mode=jnp.where(flies, FLYING, mode),
-            state=jnp.where(flies, lift_off(self.scene, state_after, self.passive is not None), transition.state),
+            mode=jnp.where(flies, airborne.FLYING, mode),
+            state=jnp.where(
+                flies, airborne.lift_off(self.scene, state_after, self.passive is not None), transition.state
+            ),
             status=jnp.where(flies, RUNNING, transition.status),
             counts=jnp.concatenate([flies.astype(int)[None], transition.counts]),
         )
 
 
-class Land(Fly):
+class Land(airborne.Fly):
     """Flying over the arena, to a contact that slips or rolls."""
 
     def reset_map(self, state: States, left: Lanes) -> Transition:
         """Strike the arena; then rebound, or continue to slip or roll."""
         transition, stick_slip = super().reset_map(state, left), self.scene.dynamics
         assert isinstance(stick_slip, StickSlip)
-        mode = jnp.where(stick_slip.rests(transition.state[:OWN]), TOUCH_ROLLING, TOUCH_SLIPPING)
+        mode = jnp.where(stick_slip.rests(transition.state[: airborne.OWN]), TOUCH_ROLLING, TOUCH_SLIPPING)
         counts = jnp.concatenate([transition.counts, jnp.zeros_like(transition.counts)])
-        return transition._replace(mode=jnp.where(transition.mode == FLYING, FLYING, mode), counts=counts)
+        return transition._replace(
+            mode=jnp.where(transition.mode == airborne.FLYING, airborne.FLYING, mode), counts=counts
+        )
 
 
 def airborne_stick_slip_modes(
@@ -209,10 +201,10 @@ def airborne_stick_slip_modes(
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `hopping_modes`."""
     stick_slip, passive = problem.dynamics, Quadratures.of(scene.body) if with_quadratures else None
     assert isinstance(stick_slip, StickSlip)
-    options = (problem.cos_angle, problem.scales, last, OWN, passive)
+    options = (problem.cos_angle, problem.scales, last, airborne.OWN, passive)
     slips, rolls = (Touch(kind, *options, scene=scene) for kind in kinds_of(stick_slip, tolerance))
     flies = Land(scene, problem.scales, problem.cos_angle, with_quadratures)
-    first = jnp.where(stick_slip.rests(problem.states[:OWN]), TOUCH_ROLLING, TOUCH_SLIPPING)
+    first = jnp.where(stick_slip.rests(problem.states[: airborne.OWN]), TOUCH_ROLLING, TOUCH_SLIPPING)
     return (slips, flies, rolls), first
 
 
@@ -252,24 +244,24 @@ def above_the_ground(
     """States of runs, in the layout for sliding on the top's own sphere; and the distance [m] of this sphere from the
     ground with its rate [m/s]. States of other modes refer to the foot below this sphere.
     """
-    flies, flight = mode == FLYING, state[:OWN]
+    flies, flight = mode == airborne.FLYING, state[: airborne.OWN]
     if scene.body.stem is not None:
-        on_stem = lift_off(scene, flight, False, balls(scene.body)[1])
-        flies, flight = mode != SLIDING, jnp.where(mode == ON_STEM, on_stem, flight)
-    flying = flight_state(flight)
-    ground = below(scene, flying)
-    free = flying_body(scene, flying, ground)
+        on_stem = airborne.lift_off(scene, flight, False, balls(scene.body)[1])
+        flies, flight = mode != airborne.SLIDING, jnp.where(mode == airborne.ON_STEM, on_stem, flight)
+    flying = airborne.flight_state(flight)
+    ground = airborne.below(scene, flying)
+    free = airborne.flying_body(scene, flying, ground)
     rate = gap_rate(scene.body, balls(scene.body)[0], free)
-    contact = jnp.where(flies, in_contact(ground, free), state[:OWN])
+    contact = jnp.where(flies, airborne.in_contact(ground, free), state[: airborne.OWN])
     return contact, jnp.where(flies, ground.gap, 0.0), jnp.where(flies, rate, 0.0)
 
 
 def loss(scene: Scene[Top], state: States) -> Int[Array, "..."]:
     """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
-    dynamics, state = scene.dynamics, state[:OWN]
+    dynamics, state = scene.dynamics, state[: airborne.OWN]
     if scene.body.stem is None:
         return dynamics.loss(state)
     # The domain margin of the touching sphere has vanished.
-    stem = standing(scene, balls(scene.body)[1])
+    stem = airborne.standing(scene, balls(scene.body)[1])
     on_stem = jnp.abs(stem.contact_margin(state)) < jnp.abs(dynamics.contact_margin(state))
     return jnp.where(on_stem, stem.loss(state), dynamics.loss(state))
