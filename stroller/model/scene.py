@@ -18,11 +18,9 @@ from nonholonomic.validation import (
     NOT_NEGATIVE,
     Bound,
     Bounded,
-    all_bounds,
     as_number,
     is_traced,
     largest,
-    legal,
     require_all,
     require_kind,
 )
@@ -170,13 +168,6 @@ class Scene(Bounded):
         xp = jnp if is_traced(last) or is_traced(polar) else np
         sine = xp.sin(xp.asarray(last)) if len(launch.place) == 2 else xp.asarray(last) / xp.asarray(polar)
         return xp.abs(sine) < RIGHT_ANGLE
-
-    def may_start(self, launch: Launch, *modules: PyTree) -> Bool[Array, "*cells"]:
-        """Whether the numbers of the scene, a launch and other modules are legal, cell by cell; for traced numbers,
-        which `check` ignores."""
-        bounds = [bound for module in (self, launch, *modules) for bound in all_bounds(module)]
-        is_stuck = jnp.asarray(self.sideways(launch) | self.level(launch))
-        return legal([*bounds, *self.surface.place_bounds(launch.place, self.body.wheelbase)]) & ~is_stuck
 
     def state(self, launch: Launch, driven: bool = False) -> State:
         """The state at the start of a run (see `dynamics.py` for its components).

@@ -19,7 +19,7 @@ from nonholonomic.runs.event import EventFunction, with_clock, with_event
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, run_of, statuses
 from nonholonomic.sweeps import Variable
 from nonholonomic.text import name_of
-from nonholonomic.validation import require_kind, require_scalars
+from nonholonomic.validation import all_bounds, legal, require_kind, require_scalars
 
 from ..model.input import Formula, Input, PerRide, Steady, as_jumps, at_start, check_input
 from ..model.scene import RideProblem, Scene, as_module, has_arrays
@@ -151,7 +151,10 @@ class RideModel(AbstractSceneModel):
         self.scene.check(self.launch)
 
     def legal(self) -> Bool[Array, "..."]:
-        return self.scene.may_start(self.launch, self.input)
+        scene, launch = self.scene, self.launch
+        bounds = [bound for module in (scene, launch, self.input) for bound in all_bounds(module)]
+        is_stuck = jnp.asarray(scene.sideways(launch) | scene.level(launch))
+        return legal([*bounds, *scene.surface.place_bounds(launch.place, scene.body.wheelbase)]) & ~is_stuck
 
     def for_lanes(self) -> tuple["RideModel", bool]:
         if not isinstance(self.input, Formula | Held) or has_arrays((self.scene, self.launch)):

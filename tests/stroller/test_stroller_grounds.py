@@ -74,12 +74,12 @@ def test_a_place_may_be_a_point_in_space(surface, place):
     point = np.array(surface.in_fixed_frame(position))
     launch_nearby = Launch(tuple(point + 1e-11), 0.7, 1.0)
     scene.check(launch_nearby)
-    assert bool(scene.may_start(launch_nearby))
+    assert bool(RideModel.of(scene, launch_nearby, None).legal())
     np.testing.assert_allclose(scene.state(launch_nearby), scene.state(Launch(place, 0.7, 1.0)), atol=3e-11)
     launch_off_ground = Launch(tuple(point + 1e-4), 0.7, 1.0)
     with pytest.raises(ValueError, match=r"distance = .* must be at (most|least) .*place from the surface"):
         scene.check(launch_off_ground)
-    assert not bool(scene.may_start(launch_off_ground))
+    assert not bool(RideModel.of(scene, launch_off_ground, None).legal())
 
 
 def test_numbers_of_a_place_are_named_as_the_surface_names_them():

@@ -78,16 +78,6 @@ AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
 STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
 
 
-def run_kind_of(scene: Scene) -> RunKind:
-    """The run kind of a scene."""
-    hybrid = scene.contact == "hybrid"
-    if scene.friction.set_valued:
-        return STICK_SLIP_FLY if hybrid else STICK_SLIP
-    if not hybrid:
-        return SMOOTH
-    return HYBRID if scene.flies_in_closed_form else AIRBORNE
-
-
 @compiled_setup
 def _start_with_path(scene: Scene, launch: Launch, cells: int) -> InversionProblem:
     """The launches of runs of several modes, with the passive quadratures: path, rotation and work."""
@@ -215,7 +205,12 @@ class TopModel(AbstractSceneModel):
     @property
     def kind(self) -> RunKind:
         """The kind of runs."""
-        return run_kind_of(self.scene)
+        hybrid = self.scene.contact == "hybrid"
+        if self.scene.friction.set_valued:
+            return STICK_SLIP_FLY if hybrid else STICK_SLIP
+        if not hybrid:
+            return SMOOTH
+        return HYBRID if self.scene.flies_in_closed_form else AIRBORNE
 
     @property
     def smooth(self) -> bool:
