@@ -316,38 +316,27 @@ def land(scene: Scene[Top], air: Air) -> Air:
     status = jnp.where(blow.fails, FAILED, air.status)
     after_impact = air._replace(free=blow.free, rising=blow.rebounds, open=blow.rebounds, status=status)
     if other_ball is not None:
-        after_impact = _with_other(scene, air, after_impact, other_ball, blow.is_slow)
+        # The other sphere also strikes if it is at the plane, or the top comes to rest on both.
+        closing = closing_speed(scene)
+        touches = gap(other_ball, air.free) < TOUCHING * scene.body.radius
+        falls = touches & (gap_rate(scene.body, other_ball, blow.free) < -closing)
+        leaning = LeaningDynamics.of(scene)
+        stopped_body, dissipates = leaning.stopped(air.free)
+        rests = touches & blow.is_slow & (jnp.abs(gap_rate(scene.body, other_ball, air.free)) <= closing) & dissipates
+        free, number, definite = leaning.settled(stopped_body)
+        falls &= ~rests
+        after_impact = after_impact._replace(
+            free=select(rests, free, blow.free),
+            ball=jnp.where(rests, number, jnp.where(falls, 1 - air.ball, air.ball)),
+            falls=falls,
+            status=jnp.where(rests & ~definite & (status == RUNNING), UNRESOLVED, status),
+            open=blow.rebounds | falls,
+        )
     if air.quadratures is not None:
         before, after = (energy(scene.body, scene.gravity, free) for free in (air.free, after_impact.free))
         *path, work = air.quadratures
         after_impact = after_impact._replace(quadratures=jnp.stack([*path, work + (after - before)]))
     return after_impact._replace(open=after_impact.open & ~blow.fails)
-
-
-def _with_other(
-    scene: Scene[Top], air: Air, after_impact: Air, other_ball: Ball, is_slow: Bool[Array, " cells"]
-) -> Air:
-    """Effect of an impact on the other sphere if that is at the plane: it also strikes, or the top comes to rest on
-    both.
-
-    **Arguments:** `air`: the top before the impact; `after_impact`: the top after the impact; `is_slow`: mask of the impacts
-    that are so slow that they may be the last.
-    """
-    closing = closing_speed(scene)
-    touches = gap(other_ball, air.free) < TOUCHING * scene.body.radius
-    falls = touches & (gap_rate(scene.body, other_ball, after_impact.free) < -closing)
-    leaning = LeaningDynamics.of(scene)
-    stopped_body, dissipates = leaning.stopped(air.free)
-    rests = touches & is_slow & (jnp.abs(gap_rate(scene.body, other_ball, air.free)) <= closing) & dissipates
-    free, number, definite = leaning.settled(stopped_body)
-    falls &= ~rests
-    return after_impact._replace(
-        free=select(rests, free, after_impact.free),
-        ball=jnp.where(rests, number, jnp.where(falls, 1 - air.ball, air.ball)),
-        falls=falls,
-        status=jnp.where(rests & ~definite & (after_impact.status == RUNNING), UNRESOLVED, after_impact.status),
-        open=after_impact.open | falls,
-    )
 
 
 def stem_takes_over(
