@@ -339,29 +339,6 @@ def land(scene: Scene[Top], air: Air) -> Air:
     return after_impact._replace(open=after_impact.open & ~blow.fails)
 
 
-def stem_takes_over(
-    air: Air, strikes: Bool[Array, " cells"], air_landed: Air, stem_counts: Float[Array, "..."], last: bool
-) -> Air:
-    """The top after an impact, with the event that the stem begins to carry it: the stem bears a force or an impulse, and
-    the sphere was the last to touch before.
-
-    **Arguments:** `air`: the top before the flight, if any, and the impact; `strikes`: mask of the tops whose stem is the
-    sphere that strikes; `air_landed`: the top after the impact; `stem_counts`: as for `InversionProblem`; `last`:
-    whether the run continues.
-    """
-    assert air.falls is not None
-    # A sphere that is about to strike without a flight is not the sphere that touched last.
-    last_ball = jnp.where(air.falls, 1 - air.ball, air.ball)
-    # On both spheres, the stem carries a part of the top, but the sphere still touches.
-    comes_to_rest_on_stem = ~air_landed.open & (air_landed.ball == 1 if last else air_landed.ball != 0)
-    takes_over = (last_ball == 0) & (strikes | comes_to_rest_on_stem) & (stem_counts > 0.0)
-    return air_landed._replace(
-        crossing_time=jnp.where(takes_over, air_landed.elapsed, air_landed.crossing_time),
-        status=air_landed.status if last else jnp.where(takes_over, CROSSED, air_landed.status),
-        open=air_landed.open if last else air_landed.open & ~takes_over,
-    )
-
-
 def quadratures_after(
     body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."], time: Float[Array, "..."]
 ) -> Float[Array, "7 ..."]:
@@ -495,13 +472,21 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
     def hop(self, air: Air, left: Lanes) -> tuple[Air, Air]:
         """One flight of a top whose contact is open, and the impact at its end."""
         air_after, has_landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
-        if air.falls is None:
-            air_landed = land(self.scene, air_after)
-        else:
+        if air.falls is not None:
             air_after, has_landed = select(air.falls, air, air_after), air.falls | has_landed
-            air_landed = land(self.scene, air_after)
-            if self.stem_counts is not None:
-                air_landed = stem_takes_over(air, air_after.ball == 1, air_landed, self.stem_counts, self.last)
+        air_landed = land(self.scene, air_after)
+        if air.falls is not None and self.stem_counts is not None:
+            # The stem begins to carry the top as it bears a force or an impulse, if the sphere was the last to touch before.
+            # A sphere that is about to strike without a flight is not the sphere that touched last.
+            last_ball = jnp.where(air.falls, 1 - air.ball, air.ball)
+            # On both spheres, the stem carries a part of the top, but the sphere still touches.
+            rests_on_stem = ~air_landed.open & (air_landed.ball == 1 if self.last else air_landed.ball != 0)
+            takes_over = (last_ball == 0) & ((air_after.ball == 1) | rests_on_stem) & (self.stem_counts > 0.0)
+            air_landed = air_landed._replace(
+                crossing_time=jnp.where(takes_over, air_landed.elapsed, air_landed.crossing_time),
+                status=air_landed.status if self.last else jnp.where(takes_over, CROSSED, air_landed.status),
+                open=air_landed.open if self.last else air_landed.open & ~takes_over,
+            )
         return air_after, select(air.open, select(has_landed, air_landed, air_after), air)
 
     def motion_in(self, air: Air) -> tuple[FreeBody, Float[Array, "7 cells"] | None]:
