@@ -400,7 +400,12 @@ class Fly(AbstractFlyingMode):
         if self.stem_counts is not None:
             takes_over = (state[LAST_BALL] == 0.0) & ((number == 1) | rests) & ~misses & (self.stem_counts > 0.0)
         flies = blow.rebounds | throws
-        state_after = self._after_impact(state, flying.place, ground, free, blow.free, flies)
+        state_after = jnp.where(flies, in_flight(flying.place, ground.axes, blow.free), in_contact(ground, blow.free))
+        if self.with_quadratures:
+            c_vector, (spin_angle, work) = tuple(state[OWN + k] for k in range(3)), state[OWN + 3 :]
+            c_vector = jnp.where(flies, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
+            work = work + (energy(scene.body, 0.0, blow.free) - energy(scene.body, 0.0, free))
+            state_after = jnp.concatenate([state_after, c_vector, jnp.stack([spin_angle, work])])
         if other_ball is not None:
             state_after = jnp.where(flies, state_after.at[LAST_BALL].set(number), state_after)
         status = jnp.where(misses | rests, UNRESOLVED, jnp.where(blow.fails, FAILED, RUNNING))
@@ -413,29 +418,6 @@ class Fly(AbstractFlyingMode):
             crossing_time=jnp.where(takes_over, 0.0, jnp.inf),
             counts=(blow.rebounds & ~throws).astype(int)[None],
         )
-
-    def _after_impact(
-        self,
-        state: States,
-        place: Vector,
-        ground: Below,
-        body_before: FreeBody,
-        body_after: FreeBody,
-        flies: Bool[Array, " cells"],
-    ) -> States:
-        """The state after an impact, including passive quadratures.
-
-        **Arguments:** `state`: the state in flight before the impact; `place`: the centre of mass; `ground`: the arena
-        below the sphere that strikes; `flies`: whether the top flies off, or else is in contact.
-        """
-        state_after = jnp.where(flies, in_flight(place, ground.axes, body_after), in_contact(ground, body_after))
-        if not self.with_quadratures:
-            return state_after
-        c_vector = tuple(state[OWN + k] for k in range(3))
-        c_vector = jnp.where(flies, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
-        energy_change = energy(self.scene.body, 0.0, body_after) - energy(self.scene.body, 0.0, body_before)
-        spin_angle, work = state[OWN + 3 :]
-        return jnp.concatenate([state_after, c_vector, jnp.stack([spin_angle, work + energy_change])])
 
 
 def _at_other(
