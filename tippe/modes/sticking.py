@@ -133,7 +133,7 @@ def stick_slip_modes(
     stick_slip, passive = problem.dynamics, Quadratures.of(scene.body) if with_quadratures else None
     assert isinstance(stick_slip, StickSlip)
     x_axis = 3 * isinstance(scene.body, AbstractRigidBody)
-    size = PLACE.start + len(stick_slip.frame.place_scales(scene.body.size)) + x_axis
+    size = PLACE.start + len(stick_slip.frame.place_scales(1.0)) + x_axis
     options = (problem.cos_angle, problem.scales, last, size, passive, problem.spin)
     both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds_of(stick_slip, tolerance))
     return both_modes, _first_mode(stick_slip, problem.states, size)
