@@ -368,6 +368,10 @@ def require_package(name: str, extra: str, purpose: str) -> None:
 class Bound(NamedTuple):
     """A number, its name, and the range in which it is legal; arguments as for `require`."""
 
+    # Ranges of a number as the metadata of its field.
+    POSITIVE = {"range": {"above": 0.0}}  # noqa: RUF012
+    NOT_NEGATIVE = {"range": {"at_least": 0.0}}  # noqa: RUF012
+
     value: Any
     name: str
     above: Limit = None
@@ -427,11 +431,7 @@ def explaining(constructor: Constructor) -> Constructor:
 Explaining: Any = type("Explaining", (type(eqx.Module),), {"__call__": explaining(type(eqx.Module).__call__)})
 
 
-#: Ranges of a number, as the metadata of its field.
-POSITIVE, NOT_NEGATIVE = {"range": {"above": 0.0}}, {"range": {"at_least": 0.0}}
-
-
-def _parts(name: str, value: Any) -> dict[str, Any]:
+def _parts(name: str, value: object) -> dict[str, object]:
     """The numbers of a field by their names: one number, or those of a tuple."""
     return {f"{name}[{k}]": part for k, part in enumerate(value)} if isinstance(value, tuple) else {name: value}
 
@@ -447,7 +447,7 @@ class Bounded(eqx.Module, metaclass=Explaining):
 
     def bounds(self) -> Iterator[Bound]:
         """The ranges of the module's own numbers, in the order in which they are to be checked: those that the fields
-        declare as metadata, such as `POSITIVE`; any other number with a unit must be finite, unless it is omitted. A
+        declare as metadata, such as `Bound.POSITIVE`; any other number with a unit must be finite, unless it is omitted. A
         class adds the ranges that depend on its other numbers.
 
         This is a generator, so that a range computed from another number is computed only after that number has been

@@ -15,16 +15,7 @@ from nonholonomic.compilation.components import held, map_methods
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
 from nonholonomic.text import one_line, shown
-from nonholonomic.validation import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    UNTRACEABLE,
-    Bounded,
-    as_number,
-    is_traced,
-    largest,
-    require_kind,
-)
+from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced, largest, require_kind
 
 # Argument and result of a friction law: the motion at the contact, and force and torque per unit normal force.
 
@@ -189,7 +180,7 @@ class Viscous(AbstractFriction):
     units: ClassVar[dict[str, str]] = {"mu": "s m-1"}
     isotropic: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         return ContactLoad(force=(-self.mu * slip.x, -self.mu * slip.y))
@@ -225,8 +216,8 @@ class Coulomb(AbstractFriction):
     advice: ClassVar[dict[str, str]] = ADVICE
     isotropic: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
-    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
+    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + self.slip_speed * self.slip_speed)
@@ -269,9 +260,9 @@ class Contensou(AbstractFriction):
     uses_spin: ClassVar[bool] = True
     isotropic: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
-    contact_radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
-    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
+    contact_radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
+    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         lever = 3.0 * math.pi / 16.0 * self.contact_radius
@@ -307,8 +298,8 @@ class Rolling(AbstractFriction):
     ```
     """
 
-    resistance: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
-    turning_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    resistance: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
+    turning_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
     sliding: AbstractFriction
 
     def __check_init__(self):
@@ -392,7 +383,7 @@ class SetValuedCoulomb(AbstractFriction):
     units: ClassVar[dict[str, str]] = {"mu": "1"}
     set_valued: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         """The load of a slipping contact; at zero slip, where the law does not define it, the load is 0."""

@@ -14,16 +14,7 @@ from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, Spher
 from nonholonomic.geometry.surface import as_surface
 from nonholonomic.integration import AbstractProblem, Jumps
 from nonholonomic.text import is_array, is_users, parted, shown, suspected_gravity
-from nonholonomic.validation import (
-    NOT_NEGATIVE,
-    Bound,
-    Bounded,
-    as_number,
-    is_traced,
-    largest,
-    require_all,
-    require_kind,
-)
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, largest, require_all, require_kind
 
 from .dynamics import Dynamics, State
 from .input import MOST_ELEMENTS, Formula, Input, PerRide, at_start, jump_times
@@ -90,7 +81,7 @@ class Scene(Bounded):
     body: Stroller
     surface: AbstractSurface = eqx.field(converter=as_surface, default=Plane())
     friction: AbstractFriction = eqx.field(converter=as_law, default=Frictionless())
-    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=NOT_NEGATIVE)
+    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=Bound.NOT_NEGATIVE)
     side: str | None = eqx.field(static=True, default=None)
     fork: str = eqx.field(static=True, default="relative")
     heading: str = eqx.field(static=True, default="intrinsic")

@@ -25,7 +25,7 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.parameters import as_one
 from nonholonomic.text import shown
-from nonholonomic.validation import IN_DEGREES, NOT_NEGATIVE, POSITIVE, Bound, Bounded, Converted, as_number, largest
+from nonholonomic.validation import IN_DEGREES, Bound, Bounded, Converted, as_number, largest
 
 
 def as_numbers(value: Any) -> Any:
@@ -70,12 +70,14 @@ class Stroller(Bounded):
     units: ClassVar[dict[str, str]] = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2"}
     units |= {"steering_spring": "N m rad-1", "centre": "m"}
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    wheelbase: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    steering_inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    steering_spring: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None, metadata=NOT_NEGATIVE)
-    centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None, metadata=NOT_NEGATIVE)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    wheelbase: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    steering_inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    steering_spring: Float[Array, "..."] | None = eqx.field(
+        converter=none_if_zero, default=None, metadata=Bound.NOT_NEGATIVE
+    )
+    centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None, metadata=Bound.NOT_NEGATIVE)
 
     def suspicion(self) -> str | None:
         longest = largest(self.wheelbase)
@@ -207,10 +209,10 @@ class Damping(AbstractFriction):
 
     units: ClassVar[dict[str, str]] = {"rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "steering": "N m s"}
 
-    rolling: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
-    front: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=NOT_NEGATIVE)
-    scrub: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=NOT_NEGATIVE)
-    steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=NOT_NEGATIVE)
+    rolling: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
+    front: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=Bound.NOT_NEGATIVE)
+    scrub: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=Bound.NOT_NEGATIVE)
+    steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=Bound.NOT_NEGATIVE)
 
     def drag(self, wheels: WheelMotion) -> Drag:
         return Drag(
@@ -245,8 +247,8 @@ class RollingResistance(AbstractFriction):
 
     units: ClassVar[dict[str, str]] = {"coefficient": "1", "speed": "m s-1"}
 
-    coefficient: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
-    speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    coefficient: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
+    speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     def drag(self, wheels: WheelMotion) -> Drag:
         return Drag(

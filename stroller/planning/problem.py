@@ -14,8 +14,6 @@ from nonholonomic.geometry import AbstractSurface, Plane, cross, scale
 from nonholonomic.integration.problem import require_run
 from nonholonomic.text import shown
 from nonholonomic.validation import (
-    NOT_NEGATIVE,
-    POSITIVE,
     Bound,
     Bounded,
     as_number,
@@ -81,7 +79,7 @@ class Box(Bounded):
     units: ClassVar[dict[str, str]] = {"centre": "m", "size": "m", "angle": "rad"}
 
     centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
-    size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers, metadata=POSITIVE)
+    size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers, metadata=Bound.POSITIVE)
     angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
 
     def __check_init__(self):
@@ -123,7 +121,7 @@ class Disc(Bounded):
     units: ClassVar[dict[str, str]] = {"centre": "m", "radius": "m"}
 
     centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
-    radius: Float[Array, ""] = eqx.field(converter=as_number, metadata=POSITIVE)
+    radius: Float[Array, ""] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     def __check_init__(self):
         require_pair(self.centre, "centre", "(1.0, 0.5)")
@@ -155,9 +153,9 @@ class Footprint(Bounded):
 
     units: ClassVar[dict[str, str]] = {"length": "m", "width": "m", "rear": "m"}
 
-    length: Float[Array, ""] = eqx.field(converter=as_number, metadata=POSITIVE)
-    width: Float[Array, ""] = eqx.field(converter=as_number, metadata=POSITIVE)
-    rear: Float[Array, ""] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
+    length: Float[Array, ""] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    width: Float[Array, ""] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    rear: Float[Array, ""] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
@@ -321,7 +319,7 @@ class Goal(Bounded):
     place: tuple[Float[Array, ""], ...] = eqx.field(converter=as_place)
     heading: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     speed: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    within: Float[Array, ""] = eqx.field(converter=as_number, default=0.05, metadata=POSITIVE)
+    within: Float[Array, ""] = eqx.field(converter=as_number, default=0.05, metadata=Bound.POSITIVE)
 
     def suspicion(self) -> str | None:
         return suspected_degrees(self)

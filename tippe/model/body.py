@@ -24,17 +24,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, as_function, scale, sum_vectors
 from nonholonomic.text import readable_unit, shown
-from nonholonomic.validation import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    Bound,
-    Bounded,
-    as_number,
-    explaining,
-    is_traced,
-    require,
-    warn,
-)
+from nonholonomic.validation import Bound, Bounded, as_number, explaining, is_traced, require, warn
 
 
 class ContactGeometry(NamedTuple):
@@ -295,11 +285,11 @@ class Top(AbstractBody):
     advice: ClassVar[dict[str, str]] = {"diameter": "the radius is half the diameter"}
     advice |= dict.fromkeys(("offset", "I1", "I3"), "Top.turned computes offset, I1 and I3 from the shape")
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    offset: Float[Array, "..."] = eqx.field(converter=as_number, metadata=NOT_NEGATIVE)
-    I1: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    I3: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    offset: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
+    I1: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    I3: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
     stem: Stem | None = None
     #: The lengths that `turned` has assumed, as text.
     assumed: str | None = eqx.field(static=True, default=None, init=False)
@@ -503,12 +493,12 @@ class SpheroidBody(AbstractBody):
     units: ClassVar[dict[str, str]] = {"mass": "kg", "equatorial": "m", "polar": "m", "I1": "kg m2", "I3": "kg m2"}
     units |= {"offset": "m"}
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    equatorial: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    polar: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    I1: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    I3: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    offset: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=NOT_NEGATIVE)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    equatorial: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    polar: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    I1: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    I3: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    offset: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=Bound.NOT_NEGATIVE)
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
@@ -575,10 +565,10 @@ class ConvexBody(AbstractBody):
 
     units: ClassVar[dict[str, str]] = {"mass": "kg", "I1": "kg m2", "I3": "kg m2"}
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
     support: Any = eqx.field(converter=lambda value: as_function(value, "support", ("c",)))
-    I1: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
-    I3: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    I1: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    I3: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()

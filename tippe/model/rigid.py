@@ -41,7 +41,7 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.integration import Components, States
 from nonholonomic.text import shown
-from nonholonomic.validation import POSITIVE, UNTRACEABLE, ArrayOrList, Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import UNTRACEABLE, ArrayOrList, Bound, Bounded, as_number, is_traced
 
 from ..friction import AbstractFriction, ContactLoad, Slip
 from .dynamics import (
@@ -297,9 +297,9 @@ class Ellipsoid(AbstractRigidBody):
 
     units: ClassVar[dict[str, str]] = UNITS | {"semi_axes": "m"} | {f"semi_axes[{k}]": "m" for k in range(3)}
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
     semi_axes: tuple[Float[Array, "..."], ...] = eqx.field(
-        converter=several("semi_axes", (3,), ALONG_AXES), metadata=POSITIVE
+        converter=several("semi_axes", (3,), ALONG_AXES), metadata=Bound.POSITIVE
     )
     centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(converter=several("centre_of_mass", (3,), ALONG_AXES))
     inertia: Inertia = eqx.field(converter=Inertia.of)
@@ -365,7 +365,7 @@ class RigidBody(AbstractRigidBody):
 
     units: ClassVar[dict[str, str]] = UNITS
 
-    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=POSITIVE)
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
     inertia: Inertia = eqx.field(converter=Inertia.of)
     support: Any = eqx.field(converter=lambda value: as_support(value))
     centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(

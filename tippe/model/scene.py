@@ -32,17 +32,7 @@ from nonholonomic.geometry.surface import as_surface
 from nonholonomic.integration import Components, States
 from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import likely_fix, shown, suspected_gravity
-from nonholonomic.validation import (
-    POSITIVE,
-    Bound,
-    Bounded,
-    as_number,
-    explaining,
-    largest,
-    require,
-    require_all,
-    require_kind,
-)
+from nonholonomic.validation import Bound, Bounded, as_number, explaining, largest, require, require_all, require_kind
 
 from ..friction import A_LAW, AbstractFriction, Frictionless, NoSlip, SetValuedCoulomb, as_law
 from .body import AbstractBody, Top
@@ -244,7 +234,7 @@ class Scene(Bounded, Generic[Body]):
     body: Body
     surface: AbstractSurface = eqx.field(converter=as_surface, default=Plane())
     friction: AbstractFriction = eqx.field(converter=as_law, default=Frictionless())
-    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=POSITIVE)
+    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=Bound.POSITIVE)
     contact: str = eqx.field(static=True, default="stop")
     restitution: Float[Array, "..."] | None = eqx.field(
         converter=none_if_zero, default=None, metadata={"range": {"at_least": 0.0, "at_most": 1.0}}
