@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .exploration import FARTHEST, ROWS, Explorer, Mixture, Weighted, fitted, squared_distances, weighted_covariance
-from .likelihood import Measurements, Unknown
+from .likelihood import Measurements
 from .posterior import Problem, deviances, predictions
 from .search import SAME, Minima, minimise
 
@@ -438,23 +438,16 @@ def divided(
     parent = list(range(len(mixture.shares)))
     for a in range(len(parent)):
         for b in range(a):
-            ridge = _ridge(mixture, a, b)
-            density = np.logaddexp.reduce(_log_normals(mixture, ridge), axis=0)
+            # The curve on which the density of the two components has its ridge.
+            inverse = [np.linalg.inv(mixture.roots[k] @ mixture.roots[k].T) for k in (a, b)]
+            ridge = []
+            for share in np.linspace(0.0, 1.0, 33):
+                first, second = (1.0 - share) * inverse[0], share * inverse[1]
+                ridge.append(np.linalg.solve(first + second, first @ mixture.centres[a] + second @ mixture.centres[b]))
+            density = np.logaddexp.reduce(_log_normals(mixture, np.stack(ridge)), axis=0)
             if np.min(density) > min(density[0], density[-1]) + math.log(SADDLE):
                 parent = [parent[b] if group == parent[a] else group for group in parent]
     return np.array(parent)[np.argmax(_log_normals(mixture, points), axis=0)]
-
-
-def _ridge(mixture: Mixture, a: int, b: int) -> Float[np.ndarray, "points unknowns"]:
-    """The curve on which the density of two components has its ridge."""
-    inverse = [np.linalg.inv(mixture.roots[k] @ mixture.roots[k].T) for k in (a, b)]
-    curve = []
-    for share in np.linspace(0.0, 1.0, 33):
-        sides = ((1.0 - share) * inverse[0], share * inverse[1])
-        curve.append(
-            np.linalg.solve(sides[0] + sides[1], sides[0] @ mixture.centres[a] + sides[1] @ mixture.centres[b])
-        )
-    return np.stack(curve)
 
 
 def _log_normals(mixture: Mixture, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, "components n"]:
@@ -529,10 +522,19 @@ def remarks(
     explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: Float[np.ndarray, "unknowns unknowns"]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is special about the shape of a posterior: concerns and notes, in words."""
-    problem = explorer.density.problem
+    problem, region, weights = explorer.density.problem, explorer.region, sample.weights
     concerns, notes, skewed = [], [], []
     for k, (name, unknown) in enumerate(problem.free):
-        concerns += _cut(name, unknown, sample, explorer, k)
+        # A bound, or the edge of the searched region, that cuts the interval of the unknown.
+        coordinate, middle, reach = sample.pool.points[:, k], region.middle[k], FARTHEST * region.half_width[k]
+        for side, edge in (("below", middle - reach), ("above", middle + reach)):
+            if np.sum(weights[np.abs(coordinate - edge) < NEAR * 2.0 * reach]) > CUT:
+                concerns.append(f"the data do not bound {name} from {side}: its interval ends where the search ended")
+        values = np.asarray(unknown.value(coordinate))
+        low, high = quantiles(values, weights, np.array([0.025, 0.975]))
+        for bound, exists in ((unknown.lower, unknown.has_lower), (unknown.upper, unknown.has_upper)):
+            if exists and np.sum(weights[np.abs(values - bound) < NEAR * (high - low)]) > CUT:
+                concerns.append(f"the bound {float(bound):g} cuts the interval of {name}")
         low, high = distribution.interval(k, 1.96)
         sides = high - distribution.estimate[k], distribution.estimate[k] - low
         if max(sides) > SKEWED * max(min(sides), 1e-300):
@@ -548,19 +550,3 @@ def remarks(
         if factors[worst] > FACTOR:
             notes.append(f"slopes {verb} the errors {factors[worst]:.1f} times ({problem.names[worst]}): {reason}")
     return tuple(concerns), tuple(notes)
-
-
-def _cut(name: str, unknown: Unknown, sample: Weighted, explorer: Explorer, k: int) -> list[str]:
-    """Warnings of a bound, or of the edge of the searched region, that cuts the interval of an unknown."""
-    coordinate, weights = sample.pool.points[:, k], sample.weights
-    middle, reach = explorer.region.middle[k], FARTHEST * explorer.region.half_width[k]
-    words = []
-    for side, edge in (("below", middle - reach), ("above", middle + reach)):
-        if np.sum(weights[np.abs(coordinate - edge) < NEAR * 2.0 * reach]) > CUT:
-            words.append(f"the data do not bound {name} from {side}: its interval ends where the search ended")
-    values = np.asarray(unknown.value(coordinate))
-    low, high = quantiles(values, weights, np.array([0.025, 0.975]))
-    for bound, exists in ((unknown.lower, unknown.has_lower), (unknown.upper, unknown.has_upper)):
-        if exists and np.sum(weights[np.abs(values - bound) < NEAR * (high - low)]) > CUT:
-            words.append(f"the bound {float(bound):g} cuts the interval of {name}")
-    return words

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..terminal import Progress
-from .likelihood import Free, Measurements, as_gaussian, own_name
+from .likelihood import Measurements, Unknown, own_name
 from .posterior import LogDensity, compared
 
 # The likelihood of measurements whose errors are unknown: the mean over the errors, with a flat prior of their
@@ -21,23 +21,6 @@ from .posterior import LogDensity, compared
 
 #: Number of values of the logarithm of an error, and their range in units of 1 / sqrt(2 n) for n values.
 GRID, RANGE = 33, 6.0
-
-
-def log_likelihoods(
-    measurements: Measurements, prediction: Float[np.ndarray, "rows n"]
-) -> tuple[Float[np.ndarray, "rows n"], Float[np.ndarray, " rows"]]:
-    """Two log likelihoods of every row, up to constants.
-
-    **Returns:** the contribution of every measurement with its stated or guessed error; and the log likelihood of all
-    measurements, averaged over the errors that are unknown.
-    """
-    residual = compared(measurements, prediction)[0]
-    each = -0.5 * residual**2
-    estimated = np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
-    total = np.sum(each[:, ~estimated], axis=1)
-    for scales, logs in _by_error(measurements, prediction, residual, estimated):
-        total = total + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])
-    return each, total
 
 
 def draw_errors(
@@ -170,7 +153,14 @@ def fitted(
     spread = np.sqrt(np.diag(whole)) + 1e-12 * (1.0 + np.abs(mean))
     points = (points - mean) / spread
     whole = whole / np.outer(spread, spread) + 1e-9 * np.eye(size)
-    centres = _spread_centres(points, weights, components, random)
+    # First centres far from each other (k-means++).
+    chosen = [int(random.choice(len(points), p=weights))]
+    for _ in range(min(components, len(points)) - 1):
+        squares = np.min([np.sum((points - points[k]) ** 2, axis=1) for k in chosen], axis=0) * weights
+        if not np.sum(squares) > 0.0:
+            break
+        chosen.append(int(random.choice(len(points), p=squares / np.sum(squares))))
+    centres = points[chosen]
     shares, covariances = np.full(len(centres), 1.0 / len(centres)), np.tile(whole / len(centres), (len(centres), 1, 1))
     effective = 1.0 / np.sum(weights**2)
     for _ in range(ITERATIONS):
@@ -187,19 +177,6 @@ def fitted(
         covariances = np.stack([moment[1] + SHRINKAGE * whole for moment in moments])
     roots = np.linalg.cholesky(covariances)
     return Mixture(shares, mean + spread * centres, spread[:, None] * roots)
-
-
-def _spread_centres(
-    points: np.ndarray, weights: np.ndarray, count: int, random: np.random.Generator
-) -> Float[np.ndarray, "components unknowns"]:
-    """First centres, drawn far from each other (k-means++)."""
-    chosen = [int(random.choice(len(points), p=weights))]
-    for _ in range(min(count, len(points)) - 1):
-        squares = np.min([np.sum((points - points[k]) ** 2, axis=1) for k in chosen], axis=0) * weights
-        if not np.sum(squares) > 0.0:
-            break
-        chosen.append(int(random.choice(len(points), p=squares / np.sum(squares))))
-    return points[chosen]
 
 
 def squared_distances(
@@ -252,56 +229,42 @@ class Region(NamedTuple):
         inside = np.all(np.abs(points - self.middle) <= self.half_width, axis=1)
         return np.where(inside, -np.sum(np.log(2.0 * self.half_width)), -np.inf)
 
-    def log_weight(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
-        """0 in the box; outside, less with the square of the distance."""
-        beyond = (np.abs(points - self.middle) / self.half_width - 1.0).clip(0.0)
-        return -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
-
     def contains(self, points: Float[np.ndarray, "n unknowns"]) -> np.ndarray:
         """Which points are near enough for a weight."""
         return np.all(np.abs(points - self.middle) <= FARTHEST * self.half_width, axis=1)
 
 
-def region_of(free: dict[str, Free], spread: float, duration: float) -> Region:
-    """The region of the search.
+def range_of(name: str, unknown: Unknown, prior: Any, spread: float, duration: float) -> tuple[float, float]:
+    """The ends of the range in which an unknown is searched, in its coordinate.
 
-    The range of an unknown is, by the first of these rules that applies:
+    The range is, by the first of these rules that applies:
 
     - between two bounds: the whole range;
-    - with a prior: `DEVIATIONS` standard deviations around its mean, within the bounds;
+    - with a Gaussian prior: `DEVIATIONS` standard deviations around its mean, within the bounds;
     - `t0`: `OF_DURATION` of the longest recording around the start value, in both directions;
     - a number of a launch or a start: `OF_LAUNCH` of the start value (0.1 where it is 0) in both directions, within the
       bounds;
     - with one bound: a factor `spread` of the distance from the bound in both directions;
     - any other number: `spread` - 1 times the start value (or 1 where it is 0) in both directions.
 
-    **Arguments:** `free`: name -> a `Free`; `spread`: greater than 1; `duration`: of the longest recording [s], 0 if there is
-    none.
+    Except for the first two rules, its middle is the start value.
 
-    **Returns:** a `Region`, centred on the start values except for the first two rules.
+    **Arguments:** `prior`: as in `LogDensity`, or `None`; `spread`: greater than 1; `duration`: of the longest recording [s],
+    0 if there is none.
     """
-    ends = np.array([_ends(name, unknown, spread, duration) for name, unknown in free.items()])
-    return Region(np.mean(ends, axis=1), 0.5 * np.ptp(ends, axis=1))
-
-
-def _ends(name: str, unknown: Free, spread: float, duration: float) -> tuple[float, float]:
-    """The ends of the range of one coordinate."""
-    bounded = math.isfinite(unknown.lower), math.isfinite(unknown.upper)
-    start = float(unknown.coordinate(unknown.start))
-    if all(bounded) and unknown.prior is None:
+    kind, middle, is_gaussian = own_name(name), float(unknown.start), prior is not None and not callable(prior)
+    if unknown.has_lower and unknown.has_upper and not is_gaussian:
         return -5.0, 5.0
-    kind = own_name(name)
-    if unknown.prior is not None:
-        mean, deviation = as_gaussian(unknown.prior, unknown.start, name)
-        middle, reach = mean, DEVIATIONS * deviation
+    if is_gaussian:
+        middle, reach = float(prior[0]), DEVIATIONS * float(prior[1])
     elif kind == "t0" and duration > 0.0:
-        middle, reach = unknown.start, OF_DURATION * duration
+        reach = OF_DURATION * duration
     elif kind.startswith(("launch", "start")):
-        middle, reach = unknown.start, OF_LAUNCH * (abs(unknown.start) or 1.0)
-    elif any(bounded):
-        return start - math.log(spread), start + math.log(spread)
+        reach = OF_LAUNCH * (abs(middle) or 1.0)
     else:
-        return start - (spread - 1.0), start + (spread - 1.0)
+        start = float(unknown.coordinate(middle))
+        half = math.log(spread) if unknown.has_lower or unknown.has_upper else spread - 1.0
+        return start - half, start + half
     # Stay away from the bounds, where coordinates are infinite.
     margin = 0.05 * reach
     low, high = max(middle - reach, unknown.lower + margin), min(middle + reach, unknown.upper - margin)
@@ -402,18 +365,13 @@ class Explorer(NamedTuple):
 
     @classmethod
     def of(cls, density: LogDensity, spread: float, seed: int) -> "Explorer":
-        """An explorer of the region around start values, as for `region_of`, with measurements grouped by their times."""
-        free = {}
-        for name, unknown in density.problem.free:
-            prior = density.priors.get(name)
-            gaussian = None if prior is None or callable(prior) else (float(prior[0]), float(prior[1]))
-            start, lower, upper = (float(number) for number in (unknown.start, unknown.lower, unknown.upper))
-            free[name] = Free(start, lower, upper, gaussian)
-        times = np.asarray(density.measurements.time)
-        distinct = np.unique(times)
+        """An explorer of the region around start values, as for `range_of`, with measurements grouped by their times."""
+        times, free, priors = np.asarray(density.measurements.time), density.problem.free, density.priors
+        distinct, duration = np.unique(times), float(np.max(times))
         count = min(GROUPS, len(distinct))
         group = (np.searchsorted(distinct, times) * count) // len(distinct)
-        region = region_of(free, spread, float(np.max(times)))
+        ends = np.array([range_of(name, unknown, priors.get(name), spread, duration) for name, unknown in free])
+        region = Region(np.mean(ends, axis=1), 0.5 * np.ptp(ends, axis=1))
         return cls(density, region, group, np.random.default_rng(seed))
 
     @property
@@ -457,7 +415,10 @@ class Explorer(NamedTuple):
         proposals = (*pool.proposals, (len(points), proposal))
         old = np.logaddexp(pool.log_proposal, math.log(len(points)) + proposal.log_density(pool.points))
         new = np.logaddexp.reduce([math.log(n) + other.log_density(points) for n, other in proposals], axis=0)
-        parts = (points, predictions, groups, prior, log_density, self.region.log_weight(points))
+        # 0 in the region; outside, less with the square of the distance.
+        beyond = (np.abs(points - self.region.middle) / self.region.half_width - 1.0).clip(0.0)
+        log_region = -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
+        parts = (points, predictions, groups, prior, log_density, log_region)
         grown = (np.concatenate(pair) for pair in zip(pool[:6], parts, strict=True))
         return Pool(*grown, log_proposal=np.concatenate([old, new]), proposals=proposals)
 
@@ -471,23 +432,17 @@ class Explorer(NamedTuple):
             display.begin()
             current = Weighted.of(pool)
             for _ in range(ROUNDS):
-                pool = self.extended(pool, *self._proposed(current, minima))
+                mixture = self.proposal(pool, minima, 0.6 if len(pool.proposals) == 1 else KEPT)
+                # The last round draws what is missing, with some to spare.
+                rate = current.effective / max(len(current.weights) - pool.proposals[0][0], 1)
+                missing = 1.25 * (ENOUGH - current.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
+                count = self.rows if current.k >= MOST_K else int(np.clip(missing, self.rows // 8, self.rows))
+                pool = self.extended(pool, mixture.draw(count, self.random), mixture)
                 display.advance(1)
                 current = Weighted.of(pool)
                 if current.enough:
                     break
         return current
-
-    def _proposed(self, current: "Weighted", minima: Mixture | None) -> tuple[np.ndarray, Mixture]:
-        """The points of the next round, and the mixture they are drawn from."""
-        pool = current.pool
-        share = 0.6 if len(pool.proposals) == 1 else KEPT
-        mixture = self.proposal(pool, minima, share)
-        # The last round draws what is missing, with some to spare.
-        rate = current.effective / max(len(current.weights) - pool.proposals[0][0], 1)
-        missing = 1.25 * (ENOUGH - current.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
-        count = self.rows if current.k >= MOST_K else int(np.clip(missing, self.rows // 8, self.rows))
-        return mixture.draw(count, self.random), mixture
 
     def proposal(self, pool: Pool, minima: Mixture | None, share: float = KEPT) -> Mixture:
         """The mixture that fits the points so far best; the components around known minima get a share of it."""
@@ -502,13 +457,20 @@ class Explorer(NamedTuple):
     def evaluated(
         self, points: Float[np.ndarray, "rows unknowns"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Predictions, log likelihoods of all measurements, log priors and log densities of at most `ROWS` points."""
+        """Predictions, log likelihoods of all measurements, log priors and log densities of at most `ROWS` points.
+
+        The likelihood of a measurement is that with its stated or guessed error; the density is averaged over unknown errors.
+        """
         inside = self.region.contains(points)
         # Rows of NaN take no time. The program of the priors is compiled for `ROWS` rows.
         batch = np.full((ROWS, points.shape[1]), np.nan)
         batch[: len(points)][inside] = points[inside]
-        predictions = self.density.predictions(batch[: len(points)])
-        each, likelihood = log_likelihoods(self.density.measurements, predictions)
+        measurements, predictions = self.density.measurements, self.density.predictions(batch[: len(points)])
+        residual = compared(measurements, predictions)[0]
+        each, estimated = -0.5 * residual**2, np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
+        likelihood = np.sum(each[:, ~estimated], axis=1)
+        for scales, logs in _by_error(measurements, predictions, residual, estimated):
+            likelihood = likelihood + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])
         prior = np.where(inside, self.density.log_priors(batch)[: len(points)], -np.inf)
         return predictions, each, prior, likelihood + prior
 

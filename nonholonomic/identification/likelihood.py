@@ -132,10 +132,17 @@ class Measurements(eqx.Module):
         two_limits = low & high & self.censored
         middle = jnp.where(two_limits, 0.5 * (self.value + self.upper), 0.0)
         half = jnp.where(two_limits, 0.5 * (self.upper - self.value) / self.error, 1.0)
+        z, heavy = self.standardised(finite_prediction), jnp.isfinite(self.student)
+        freedom = jnp.where(heavy, self.student, 1.0)
+        share = z**2 / freedom
+        # log(1 + q) / q without 0 / 0; divided before the square root, whose slope at 0 is infinite.
+        is_small = share < 1e-8
+        flat = jnp.where(is_small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(is_small, 1.0, share))
+        of_value = jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
         residuals = jnp.select(
             [~self.censored, two_limits, low],
             [
-                self._of_value(finite_prediction),
+                of_value,
                 between((finite_prediction - middle) / self.error, half),
                 one_sided(excess),
             ],
@@ -143,17 +150,6 @@ class Measurements(eqx.Module):
         )
         is_exceeded = low & ~high & (prediction == jnp.inf)
         return jnp.where(is_finite, residuals, jnp.where(is_exceeded, 0.0, MISSING))
-
-    def _of_value(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
-        """The residual of a measured value."""
-        z = self.standardised(prediction)
-        heavy = jnp.isfinite(self.student)
-        freedom = jnp.where(heavy, self.student, 1.0)
-        share = z**2 / freedom
-        # log(1 + q) / q without 0 / 0; divided before the square root, whose slope at 0 is infinite.
-        is_small = share < 1e-8
-        flat = jnp.where(is_small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(is_small, 1.0, share))
-        return jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
 
     def whole_periods(self, off: Float[Array | np.ndarray, "... n"]) -> Any:
         """Differences rounded to the nearest whole period, without a slope; a NumPy array for a NumPy array, because JAX
@@ -246,12 +242,6 @@ def estimated_errors(
     return errors
 
 
-def down_weighted(measurements: Measurements, horizon: float) -> Measurements:
-    """The same measurements, but those after a given time have nearly no weight."""
-    is_late = measurements.time > horizon
-    return measurements.with_errors(jnp.where(is_late, measurements.error * DOWN_WEIGHTED, measurements.error))
-
-
 # Unknown parameters: start value, bounds, and the coordinate in which they are fitted.
 
 
@@ -292,14 +282,6 @@ class Free(NamedTuple):
     def positive(self) -> bool:
         """Whether the parameter cannot be negative."""
         return self.lower >= 0.0
-
-    def value(self, coordinate: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
-        """The parameter at a coordinate."""
-        return Unknown.of(self).value(coordinate)
-
-    def coordinate(self, value: ArrayLike) -> Float[Array, "..."]:
-        """The coordinate of a value strictly within the bounds; the inverse of `value`."""
-        return Unknown.of(self).coordinate(value)
 
 
 def as_gaussian(prior: Any, start: float, name: str) -> tuple[float, float]:

@@ -120,11 +120,10 @@ def _differentiated(
     problem: Problem, coordinates: Float[Array | np.ndarray, "rows unknowns"]
 ) -> tuple[Float[Array, "rows n"], Float[Array, "rows n unknowns"]]:
     """Predictions and their slopes; rows are independent, so a coordinate is moved in all of them at once."""
-
-    def along(direction):
-        return jax.jvp(problem.predict, (coordinates,), (jnp.broadcast_to(direction, coordinates.shape),))
-
-    values, slopes = jax.vmap(along, out_axes=(0, -1))(jnp.eye(coordinates.shape[-1]))
+    values, slopes = jax.vmap(
+        lambda direction: jax.jvp(problem.predict, (coordinates,), (jnp.broadcast_to(direction, coordinates.shape),)),
+        out_axes=(0, -1),
+    )(jnp.eye(coordinates.shape[-1]))
     return values[0], jnp.where(jnp.isfinite(slopes), slopes, 0.0)
 
 
@@ -177,13 +176,10 @@ def _in_parts(
     rows = rows_of_part if jax.default_backend() == "cpu" else MOST_ROWS
     padding = np.full((-len(coordinates) % rows, coordinates.shape[1]), np.nan)
     parts = np.concatenate([coordinates, padding]).reshape(-1, rows, coordinates.shape[1])
-
-    def of_part(part: Rows) -> list[np.ndarray]:
-        return [np.asarray(result) for result in function(part)]
-
     with ThreadPoolExecutor(cores) as threads:
         # A single core stays in this thread, in which JAX's contexts hold, such as that of `jax.default_device`.
-        results = zip(*(threads.map if cores > 1 else map)(of_part, parts), strict=True)
+        each = threads.map if cores > 1 else map
+        results = zip(*each(lambda part: [np.asarray(result) for result in function(part)], parts), strict=True)
         return tuple(np.concatenate(result)[: len(coordinates)] for result in results)
 
 
@@ -359,12 +355,6 @@ class LogDensity(eqx.Module):
         return np.array([prior is not None or (u.has_lower and u.has_upper) for u, prior in pairs])
 
     @property
-    def _first_errors(self) -> Float[Array, " errors"]:
-        """The first guesses of the unknown errors, one for each series."""
-        mask = [self.measurements.estimated & (self.measurements.series == k) for k in self.open_series]
-        return jnp.array([self.measurements.error[jnp.argmax(series)] for series in mask])
-
-    @property
     def start(self) -> Float[Array, " unknowns"]:
         """The coordinates of the start."""
         values = [float(unknown.coordinate(unknown.start)) for unknown in self.problem.unknowns]
@@ -388,7 +378,10 @@ class LogDensity(eqx.Module):
                 f"{', '.join(self.names)}"
             )
         unknowns = self.problem.values(coordinates[..., :numbers])
-        errors = self._first_errors * jnp.exp(coordinates[..., numbers:])
+        # The first guesses of the unknown errors, one for each series.
+        mask = [self.measurements.estimated & (self.measurements.series == k) for k in self.open_series]
+        guesses = jnp.array([self.measurements.error[jnp.argmax(series)] for series in mask])
+        errors = guesses * jnp.exp(coordinates[..., numbers:])
         return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([unknowns, errors], axis=-1), -1, 0), strict=True))
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:

@@ -245,14 +245,13 @@ class AbstractRecording(eqx.Module):
 
 def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " columns"]:
     """A first guess of the errors: the scatter of the second differences, or of the values if there are too few."""
-
-    def of(column: np.ndarray) -> float:
+    guesses = []
+    for column in value.T:
         observed = column[np.isfinite(column)]
         second = np.diff(observed, 2)
         guess = np.median(np.abs(second)) / 0.6745 / math.sqrt(6.0) if len(second) > 2 else 0.0
-        return guess or 0.1 * float(np.ptp(observed)) or 1.0
-
-    return np.array([of(column) for column in value.T])
+        guesses.append(guess or 0.1 * float(np.ptp(observed)) or 1.0)
+    return np.array(guesses)
 
 
 # A text file of columns with a header line, read in the units of the file.
@@ -321,7 +320,14 @@ class TextTable(NamedTuple):
             if name.lower() in known:
                 if name.lower() in columns:
                     raise self._ambiguous("columns", name.lower(), [columns[name.lower()], header])
-                columns[name.lower()] = header if unit else (header, _unit_of(name.lower(), known))
+                si = known[name.lower()]
+                # Only a number without a unit needs none in its header.
+                if not unit and si != "1":
+                    raise ValueError(
+                        f"columns: the header {name.lower()!r} must have a unit, such as '{name.lower()} [{si}]'; or pass "
+                        "columns, a dictionary"
+                    )
+                columns[name.lower()] = header if unit else (header, "1")
         if not columns.keys() - {"time", "frame"}:
             raise ValueError(
                 f"path = {str(self.path)!r}: no header is the name of a quantity with its unit, such as 'theta [deg]': pass "
@@ -341,8 +347,25 @@ class TextTable(NamedTuple):
         """A column in SI units, NaN where it is missing. **Arguments:** `argument`: as for `parts`; `remark`: an addition to
         the message about a cell that is not a number; `infinite`: whether numbers may be infinite."""
         header, size = self.parts(name, header_and_unit, si, argument)
-        numbers = zip(self.lines, self.cells[header], strict=True)
-        return size * np.array([self._number(header, line, cell, remark, infinite) for line, cell in numbers])
+        numbers = np.full(len(self.lines), math.nan)
+        for row, (line, cell) in enumerate(zip(self.lines, self.cells[header], strict=True)):
+            if cell.lower() in MISSING:
+                continue
+            place = f"{header} = {cell!r} in line {line} of {str(self.path)!r}"
+            if self.decimal == "," and "." in cell:
+                raise ValueError(
+                    f"{place} has a decimal point, or a mark of thousands, although decimal = ',': remove marks of thousands "
+                    "from the file; if its numbers have decimal points, leave out decimal"
+                )
+            try:
+                # Python also reads 1_000.
+                numbers[row] = float("_" if "_" in cell else cell.replace(",", ".") if self.decimal == "," else cell)
+            except ValueError:
+                hint = ": pass decimal=',' if it has a decimal comma" if "," in cell and self.decimal == "." else remark
+                raise ValueError(f"{place} is not a number{hint}") from None
+            if math.isinf(numbers[row]) and not infinite:
+                raise ValueError(f"{place} must be finite: write n/a, or nothing, for a missing sample")
+        return size * numbers
 
     def errors(self, name: str, header_and_unit: Column, si: str) -> np.ndarray:
         """The standard errors of a column in SI units, from a column of their own or the same in all lines."""
@@ -351,25 +374,6 @@ class TextTable(NamedTuple):
             return self.numbers(name, header_and_unit, si, "error")
         require(header, f"error of {name}", above=0.0)
         return np.full(len(self.lines), size * float(header))
-
-    def _number(self, header: str, line: int, cell: str, remark: str, infinite: bool) -> float:
-        if cell.lower() in MISSING:
-            return math.nan
-        place = f"{header} = {cell!r} in line {line} of {str(self.path)!r}"
-        if self.decimal == "," and "." in cell:
-            raise ValueError(
-                f"{place} has a decimal point, or a mark of thousands, although decimal = ',': remove marks of thousands from "
-                "the file; if its numbers have decimal points, leave out decimal"
-            )
-        try:
-            # Python also reads 1_000.
-            number = float("_" if "_" in cell else cell.replace(",", ".") if self.decimal == "," else cell)
-        except ValueError:
-            hint = ": pass decimal=',' if it has a decimal comma" if "," in cell and self.decimal == "." else remark
-            raise ValueError(f"{place} is not a number{hint}") from None
-        if math.isinf(number) and not infinite:
-            raise ValueError(f"{place} must be finite: write n/a, or nothing, for a missing sample")
-        return number
 
     def parts(self, name: str, header_and_unit: Column, si: str, argument: str) -> tuple[Any, float]:
         """The header of a column (or, for an error, possibly a number), and the factor that converts the file's numbers to
@@ -455,15 +459,6 @@ def _split(header: str) -> tuple[str, str]:
     unit = next(part for part in match.groups()[1:] if part).strip()
     known = unit in SYNONYMS or any(unit in units for units in UNITS.values())
     return (match[1].strip(), unit) if known else (header.strip(), "")
-
-
-def _unit_of(name: str, known: Mapping[str, str]) -> str:
-    """The unit of a column whose header has none: only a number without a unit needs none."""
-    if known[name] != "1":
-        raise ValueError(
-            f"columns: the header {name!r} must have a unit, such as '{name} [{known[name]}]'; or pass columns, a dictionary"
-        )
-    return "1"
 
 
 # Read recordings, and launches with measured times, from a file of columns, in the units of the file.
@@ -598,7 +593,17 @@ def read_launches(
     names = [name for name in columns if name != "time"]
     time, until = _times_of_launches(file, columns["time"], never)
     numbers = {name: file.numbers(name, columns[name], units[name]) for name in names}
-    errors = _errors_of_times(file, error)
+    if isinstance(error, Mapping):
+        if set(error) != {"time"}:
+            raise ValueError(
+                f"error = {shown(error)} must be {{'time': (standard error, unit)}} or a number of seconds"
+            )
+        errors = file.errors("time", error["time"], "s")
+    else:
+        require(error, "error", above=0.0)
+        if np.ndim(error) != 0:
+            raise ValueError("error must be one number [s], or {'time': (header of a column of standard errors, unit)}")
+        errors = np.asarray(error, float)
     mask = ~np.any(np.isnan([time, *numbers.values(), np.broadcast_to(errors, time.shape)]), axis=0)
     if not np.any(mask):
         raise ValueError(f"path = {str(file.path)!r} must have at least one line with {', '.join(columns)}")
@@ -662,20 +667,6 @@ def _times_of_launches(
         if value <= 0.0:
             raise ValueError(f"{header} = {cell!r} in line {line} of {str(file.path)!r} must be greater than 0")
     return np.where(is_limit, np.inf, time), np.where(is_limit, time, np.nan)
-
-
-def _errors_of_times(file: TextTable, error: float | Mapping[str, Column]) -> Float[np.ndarray, "*lines"]:
-    """The standard errors of the times [s]."""
-    if isinstance(error, Mapping):
-        if set(error) != {"time"}:
-            raise ValueError(
-                f"error = {shown(error)} must be {{'time': (standard error, unit)}} or a number of seconds"
-            )
-        return file.errors("time", error["time"], "s")
-    require(error, "error", above=0.0)
-    if np.ndim(error) != 0:
-        raise ValueError("error must be one number [s], or {'time': (header of a column of standard errors, unit)}")
-    return np.asarray(error, float)
 
 
 def _times(file: TextTable, columns: Mapping[str, Column], fps: float | None) -> np.ndarray:

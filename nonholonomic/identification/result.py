@@ -158,26 +158,24 @@ class Identification:
         missing.
         """
         k = self._place(name)
-        if values is not None:
-            return self._profiled(k, name, values)
-        if k not in self.profiles:
-            error = self.standard_errors[self.problem.names[k]]
-            if not np.isfinite(error):
-                word = "infinite" if np.isinf(error) else "unknown"
-                raise ValueError(f"values must be given for {name!r}, whose standard error is {word}")
-            self.profiles[k] = self._profiled(k, name, np.linspace(*self.interval(name, 3.0), 13))
-        return self.profiles[k]
-
-    def _profiled(self, k: int, name: str, values: ArrayLike) -> Profile:
-        """The profile of the parameter with index `k`, which the user calls `name`."""
-        free, values = self.problem.unknowns[k], np.atleast_1d(np.asarray(values, float))
-        if not np.all((values > free.lower) & (values < free.upper)):
+        if values is None and k in self.profiles:
+            return self.profiles[k]
+        free, error = self.problem.unknowns[k], self.standard_errors[self.problem.names[k]]
+        if values is None and not np.isfinite(error):
+            word = "infinite" if np.isinf(error) else "unknown"
+            raise ValueError(f"values must be given for {name!r}, whose standard error is {word}")
+        held = (
+            np.linspace(*self.interval(name, 3.0), 13) if values is None else np.atleast_1d(np.asarray(values, float))
+        )
+        if not np.all((held > free.lower) & (held < free.upper)):
             raise ValueError(
-                f"values = {shown(values)} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}"
+                f"values = {shown(held)} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}"
             )
-        profile = profiled(self, k, values)
+        profile = profiled(self, k, held)
         if concern := profile.concern(name):
             warn(concern, FitWarning)
+        if values is None:
+            self.profiles[k] = profile
         return profile
 
     @property
@@ -478,13 +476,24 @@ class Draws(NamedTuple):
         # For a single unknown, the diagnostics are numbers instead of lists.
         diagnostics = (np.ravel(numbers).tolist() for numbers in _diagnosed(coordinates))
         r_hat, ess = (ByName(zip(density.names, numbers, strict=True)) for numbers in diagnostics)
-        flaws, concerns = _judged(ess, len(coordinates), accepted), ()
+        chains, concerns, flaws = len(coordinates), (), []
+        if accepted < LEAST_ACCEPTED:
+            flaws.append(
+                f"only {100.0 * accepted:.2g} % of the proposals were accepted: start closer, or state priors or bounds that "
+                "contain the truth"
+            )
+        name, least = min(ess.items(), key=lambda item: item[1] if item[1] > 0.0 else 0.0)
+        # The ESS of chains that never move is not a number.
+        if not least >= LEAST_ESS * chains:
+            flaws.append(
+                f"the ESS of {name} is {least:.0f}, below {LEAST_ESS:.0f} for each of {chains} chains: ask for more draws"
+            )
         if excess > FAR_BELOW + len(ess):
             concerns = (
                 f"the start is more probable than the draws, by a factor of exp({excess:.4g}): the search missed its "
                 "surroundings; start closer, state priors or bounds, or pass the coordinates of a fit",
             )
-        return cls(values, coordinates, r_hat, ess, accepted, runs, density.units, flaws, concerns)
+        return cls(values, coordinates, r_hat, ess, accepted, runs, density.units, tuple(flaws), concerns)
 
     def __str__(self) -> str:
         width = max(map(len, self.values))
@@ -560,23 +569,6 @@ def sample(
     return posterior
 
 
-def _judged(ess: dict[str, float], chains: int, accepted: float) -> tuple[str, ...]:
-    """Why draws are not from a posterior, in words."""
-    name, least = min(ess.items(), key=lambda item: item[1] if item[1] > 0.0 else 0.0)
-    flaws = []
-    if accepted < LEAST_ACCEPTED:
-        flaws.append(
-            f"only {100.0 * accepted:.2g} % of the proposals were accepted: start closer, or state priors or bounds that "
-            "contain the truth"
-        )
-    # The ESS of chains that never move is not a number.
-    if not least >= LEAST_ESS * chains:
-        flaws.append(
-            f"the ESS of {name} is {least:.0f}, below {LEAST_ESS:.0f} for each of {chains} chains: ask for more draws"
-        )
-    return tuple(flaws)
-
-
 def drawn(
     density: LogDensity, known: Mixture | None, sizes: tuple[int, int, int], seed: int, progress: bool
 ) -> tuple[Float[np.ndarray, "chains draws unknowns"], float, int, float]:
@@ -601,29 +593,20 @@ def drawn(
     parts = [explorer.evaluated(every[first : first + ROWS]) for first in range(0, len(every), ROWS)]
     predictions, log_density = (np.concatenate([part[k] for part in parts]) for k in (0, 3))
     order = random.permutation(np.arange(chains, len(points))).reshape(steps, chains)
-    path, accepted = _chains(order, log_density[:-1] - proposal.log_density(points), chains, random)
-    kept = path[discarded + MOVES - 1 :: MOVES].T.reshape(-1)
-    errors = draw_errors(density.measurements, predictions[kept], random)
-    coordinates = np.concatenate([points[kept], errors], axis=1).reshape(chains, draws, -1)
-    excess = float(log_density[-1] - np.median(log_density[kept]))
-    return coordinates, accepted, len(explored.weights) + len(points), excess
-
-
-def _chains(
-    order: np.ndarray, ratios: Float[np.ndarray, " points"], chains: int, random: np.random.Generator
-) -> tuple[np.ndarray, float]:
-    """The index of the point of every chain after each step, (steps, chains), and the fraction of accepted proposals.
-
-    The first points are those at which the chains begin.
-    """
+    # The chains begin at the first points; the index of the point of every chain after each step.
     state, path, accepted = np.arange(chains), np.empty(order.shape, int), 0.0
+    ratios = log_density[:-1] - proposal.log_density(points)
     ratios = np.where(np.isfinite(ratios), ratios, -np.inf)
     for step, proposed in enumerate(order):
         accept = np.log(random.uniform(size=chains)) < ratios[proposed] - ratios[state]
         state = np.where(accept, proposed, state)
         path[step] = state
         accepted += float(np.mean(accept)) / len(order)
-    return path, accepted
+    kept = path[discarded + MOVES - 1 :: MOVES].T.reshape(-1)
+    errors = draw_errors(density.measurements, predictions[kept], random)
+    coordinates = np.concatenate([points[kept], errors], axis=1).reshape(chains, draws, -1)
+    excess = float(log_density[-1] - np.median(log_density[kept]))
+    return coordinates, accepted, len(explored.weights) + len(points), excess
 
 
 @jax.jit

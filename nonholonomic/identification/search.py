@@ -14,13 +14,14 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
 from ..terminal import Progress
 from ..validation import warn
 from .exploration import Explorer, Mixture, Pool, Weighted
-from .likelihood import Measurements, down_weighted, estimated_errors
+from .likelihood import DOWN_WEIGHTED, Measurements, estimated_errors
 from .posterior import Linearised, Problem, deviances, linearise, predictions, predictions_and_slopes, weighed
 from .recording import AbstractRecording
 
@@ -113,11 +114,11 @@ def minimise(
 
 def chosen(improves: Bool[np.ndarray, " rows"], new: PyTree, old: PyTree) -> PyTree:
     """The new rows of all arrays where they are better, the old ones elsewhere."""
-
-    def of_array(new: np.ndarray, old: np.ndarray) -> np.ndarray:
-        return np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
-
-    return jax.tree.map(of_array, new, old)
+    return jax.tree.map(
+        lambda new, old: np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old),
+        new,
+        old,
+    )
 
 
 def _step(
@@ -309,17 +310,6 @@ class Minima(NamedTuple):
         ends = jax.tree.map(lambda *parts: np.concatenate(parts)[order], *(minima[:4] for minima in pair))
         return Minima._make((*ends, measurements))
 
-    def with_rows(self, rows: Int[np.ndarray, " few"], later: "Minima") -> "Minima":
-        """These minima, of which some rows were fitted further."""
-
-        def replaced(mine: np.ndarray, others: np.ndarray) -> np.ndarray:
-            mine = np.array(mine)
-            mine[rows] = others
-            return mine
-
-        coordinates, converged, linearised = jax.tree.map(replaced, self[1:4], later[1:4])
-        return Minima(self.starts, coordinates, converged, linearised, later.measurements)
-
     def between(self) -> Float[np.ndarray, "rows unknowns"]:
         """Points between the best end and the others, and beyond it, the nearest first.
 
@@ -386,7 +376,9 @@ def refine(
         steps, coordinates = min(max_steps, AT_ONCE), starts
         minima = minimise(problem, starts, measurements, max_steps=steps, progress=progress)
         for part in PARTS:
-            early = down_weighted(measurements, part * duration)
+            # Later measurements have nearly no weight.
+            factor = jnp.where(measurements.time > part * duration, DOWN_WEIGHTED, 1.0)
+            early = measurements.with_errors(measurements.error * factor)
             few = min(max_steps, OF_PART)
             coordinates = minimise(problem, coordinates, early, max_steps=few, progress=progress).coordinates
         by_parts = minimise(problem, coordinates, measurements, max_steps=2 * steps, progress=progress)
@@ -546,4 +538,9 @@ def _improved(problem: Problem, minima: Minima, sample: Weighted, max_steps: int
         return minima
     rows = np.argsort(minima.deviance)[:count]
     later = refine(problem, minima.coordinates[rows], minima.measurements, max_steps, progress)
-    return minima.weighed(problem, later.measurements).with_rows(rows, later)
+    # The rows that were fitted further replace the old ones.
+    place = np.arange(len(minima.starts))
+    place[rows] = len(place) + np.arange(count)
+    pair = minima.weighed(problem, later.measurements)[1:4], later[1:4]
+    ends = jax.tree.map(lambda old, new: np.concatenate([old, new])[place], *pair)
+    return Minima(minima.starts, *ends, later.measurements)

@@ -13,8 +13,8 @@ from close import assert_close
 from terminal import Terminal
 
 from nonholonomic.identification import FitWarning, Free, Measurements, identify, search
-from nonholonomic.identification.exploration import region_of
-from nonholonomic.identification.likelihood import MISSING, one_sided
+from nonholonomic.identification.exploration import range_of
+from nonholonomic.identification.likelihood import MISSING, Unknown, one_sided
 from nonholonomic.identification.search import coordinate_covariance
 from nonholonomic.parameters import full_name
 
@@ -137,7 +137,8 @@ def test_bounds_are_kept_and_positive_numbers_are_fitted_in_logarithms():
         fit = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0, 3.0)})
     assert 2.99 < fit.estimates["x"] < 3.0
     for free in (Free(2.0), Free(2.0, 0.0), Free(2.0, -1.0, 3.0), Free(2.0, upper=5.0)):
-        assert_close(free.value(free.coordinate(2.5)), 2.5, rtol=1e-12)
+        unknown = Unknown.of(free)
+        assert_close(unknown.value(unknown.coordinate(2.5)), 2.5, rtol=1e-12)
     fit = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0)})
     assert_close(np.sqrt(fit.coordinate_covariance[0, 0]), 0.1 / np.sqrt(2.0) / 4.05, rtol=1e-4)
 
@@ -219,8 +220,9 @@ def test_names_are_paths_or_their_ends():
 
 @pytest.mark.parametrize(("name", "half_width"), [("start[0].x", 0.1), ("modes[0].start", 2.0)])
 def test_the_range_of_a_number_is_the_same_for_one_of_several_data(name, half_width):
-    free = {name: Free(2.0), f"data[0].{name}": Free(2.0)}
-    assert_close(region_of(free, 3.0, 0.0).half_width, half_width, rtol=1e-12)
+    for full in (name, f"data[0].{name}"):
+        low, high = range_of(full, Unknown.of(Free(2.0)), None, 3.0, 0.0)
+        assert_close(0.5 * (high - low), half_width, rtol=1e-12)
 
 
 def test_the_verdict_tells_that_an_estimate_is_outside_of_the_searched_range():
