@@ -7,7 +7,6 @@ import inspect
 import math
 import operator
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -308,27 +307,6 @@ def suspected_gravity(value: float) -> str | None:
 def counted(count: int, noun: str) -> str:
     """A count with its noun, such as "1 number" and "2 numbers"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def batch_title(shape: tuple[int, ...], words: Iterable[str] = ()) -> str:
-    """A line for a batch of runs, or for a run inside a transformation.
-
-    **Arguments:** `shape`: that of the times, which are the last axis; `words`: how each run ended, if known.
-
-    **Example:**
-
-    >>> from nonholonomic.text import batch_title
-    >>> batch_title((3, 20), ["completed", "completed", "failed"])
-    '3 runs of 20 times: 2 completed, 1 failed'
-    """
-    *batch, times = shape
-    ends = ", ".join(f"{count} {word}" for word, count in Counter(words).items())
-    runs = (
-        f"{math.prod(batch)} runs of {times} times"
-        if batch
-        else f"Trajectory of {times} times, inside a transformation"
-    )
-    return f"{runs}: {ends}" if ends else runs
 
 
 def one_line(module: PyTree, with_units: bool = True) -> str:

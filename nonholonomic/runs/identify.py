@@ -108,6 +108,9 @@ class AbstractEventTimes(eqx.Module):
     until: eqx.AbstractVar[Float[Array, "..."] | None]
     student: eqx.AbstractVar[Float[Array, ""] | None]
 
+    #: A label for each time.
+    labels: eqx.AbstractVar[tuple[str, ...]]
+
     #: Whether times through several modes come from the programs of tables, which is faster for flights in closed form.
     by_tables: ClassVar[bool] = False
 
@@ -169,11 +172,6 @@ class AbstractEventTimes(eqx.Module):
         is_before = (first == 0.0) & np.isfinite(last)
         student = math.inf if self.student is None else float(self.student)
         return Measurements(np.where(is_before, -np.inf, first), self.error, upper=last, student=student)
-
-    @property
-    @abc.abstractmethod
-    def labels(self) -> tuple[str, ...]:
-        """A label for each time."""
 
     @abc.abstractmethod
     def model(self, system: object) -> AbstractModel:
@@ -623,11 +621,12 @@ def prepared(
         own.append(names)
         check_run(source.model, end, tolerance)
     first = sources[0].model
-
-    def check(values: dict[str, float]) -> None:
-        first.require_values({name: value for name, value in values.items() if name != "t0"})
-
-    unknowns = free_numbers(free, [name for name in first.known if name not in own[0]], own, check)
+    unknowns = free_numbers(
+        free,
+        [name for name in first.known if name not in own[0]],
+        own,
+        lambda values: first.require_values({name: value for name, value in values.items() if name != "t0"}),
+    )
     require_apart("free", unknowns)
     measurements, labels, seen = joined_data(several)
     return DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS)), measurements, labels, unknowns

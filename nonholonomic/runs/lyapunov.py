@@ -66,7 +66,7 @@ class LyapunovExponent(NamedTuple):
     times: Float[np.ndarray, " stretches"]
     running: Float[np.ndarray, "stretches ..."]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         columns = map(np.ravel, (self.exponent, self.error, self.status, self.end_time))
         lines = [
             f"{value:.4g} +- {error:.2g} 1/s, {word} at {end:.6g} s"
@@ -78,9 +78,6 @@ class LyapunovExponent(NamedTuple):
         return "\n".join(
             ["largest Lyapunov exponents", *(f"  {k}: {line}" for k, line in enumerate(lines[:MOST_LINES])), *rest]
         )
-
-    def __repr__(self) -> str:
-        return str(self)
 
 
 @status_line("simulating")
@@ -138,7 +135,11 @@ def exponent_of_model(model: AbstractModel, t1: float, settings: Settings, shape
     direction = model.direction(cells)
     if model.smooth:
         growths = growth(model.problem(cells, model.comparable), direction, t1, STRETCHES, settings)
-        ended: Any = _outcome(growths)
+        # The end of smooth runs, as an outcome without an event.
+        none, steps = jnp.full(growths.status.shape, jnp.inf), jnp.asarray(growths.steps)
+        ending = (jnp.asarray(growths.end_time), jnp.asarray(growths.state))
+        counts = (steps, jnp.zeros_like(steps), jnp.stack([none, *jnp.zeros((2, *none.shape))]))
+        ended: Any = Outcome(jnp.asarray(growths.status), none, none, *ending, *counts)
     else:
         growths, ended = _through_modes(model, direction, t1, cells, settings)
     status = np.asarray(_ended(model, ended, settings.tolerance))
@@ -160,14 +161,6 @@ def exponent_of_model(model: AbstractModel, t1: float, settings: Settings, shape
 
 
 _ended = eqx.filter_jit(lambda model, outcome, tolerance: model.ended(outcome, tolerance))
-
-
-def _outcome(growths: Growth) -> Outcome[Array]:
-    """The end of smooth runs, as an outcome without an event."""
-    none, steps = jnp.full(growths.status.shape, jnp.inf), jnp.asarray(growths.steps)
-    ending = (jnp.asarray(growths.end_time), jnp.asarray(growths.state))
-    counts = (steps, jnp.zeros_like(steps), jnp.stack([none, *jnp.zeros((2, *none.shape))]))
-    return Outcome(jnp.asarray(growths.status), none, none, *ending, *counts)
 
 
 def _through_modes(

@@ -56,15 +56,13 @@ class AbstractModel(eqx.Module):
 
     # The parameters by name.
 
+    #: The full names of the parameters; those of the start begin with "start" or "launch".
+    known: eqx.AbstractVar[list[str]]
+
     @abc.abstractmethod
     def full_name(self, argument: str, name: str) -> str:
         """The full name of a parameter for its name or its unambiguous end; raises `ValueError` that names the
         argument."""
-
-    @property
-    @abc.abstractmethod
-    def known(self) -> list[str]:
-        """The full names of the parameters; those of the start begin with "start" or "launch"."""
 
     @abc.abstractmethod
     def value(self, name: str) -> Array:
@@ -107,20 +105,21 @@ class AbstractModel(eqx.Module):
 
     # The motion.
 
-    @property
-    @abc.abstractmethod
-    def smooth(self) -> bool:
-        """Whether a run is a single mode without a reset map."""
+    #: Whether a run is a single mode without a reset map, and whether there is an event.
+    smooth: eqx.AbstractVar[bool]
+    has_event: eqx.AbstractVar[bool]
 
-    @property
-    @abc.abstractmethod
-    def has_event(self) -> bool:
-        """Whether there is an event."""
+    #: Further variables of a table that are times: name -> (description, the model with its event).
+    further_times: ClassVar[dict[str, tuple[str, Any]]] = {}
 
-    @property
-    def further_times(self) -> dict[str, tuple[str, "AbstractModel"]]:
-        """Further variables of a table that are times: name -> (description, the model with its event)."""
-        return {}
+    #: Name and description of each row of `Transition.counts`.
+    counters: ClassVar[dict[str, str]] = {}
+
+    #: The slopes that guide a fit: "exact", or "differences" if derivatives do not show the trend of times.
+    fit_slopes: ClassVar[str] = "exact"
+
+    #: Whether programs take much longer to compile than to run, above all those with derivatives.
+    compiles_slowly: ClassVar[bool] = False
 
     def require_differentiable(self, nested: bool, continues: bool = False) -> None:
         """Raise `ValueError` unless runs have derivatives; `nested`: second derivatives; `continues`: whether runs
@@ -130,25 +129,10 @@ class AbstractModel(eqx.Module):
                 "second derivatives are not available through resets; take differences of a gradient instead"
             )
 
-    @property
-    def fit_slopes(self) -> str:
-        """The slopes that guide a fit: "exact", or "differences" if derivatives do not show the trend of times."""
-        return "exact"
-
-    @property
-    def compiles_slowly(self) -> bool:
-        """Whether programs take much longer to compile than to run, above all those with derivatives."""
-        return False
-
     def for_lanes(self) -> tuple["AbstractModel", bool]:
         """The model in a form that is fastest where runs in transformations share lanes, and whether arrays among its leaves
         have the lanes in their last axis."""
         return self, False
-
-    @property
-    def counters(self) -> dict[str, str]:
-        """Name and description of each row of `Transition.counts`."""
-        return {}
 
     @abc.abstractmethod
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
@@ -180,10 +164,14 @@ class AbstractModel(eqx.Module):
 
     # What a state means.
 
-    @property
-    @abc.abstractmethod
-    def quantities(self) -> dict[str, Quantity]:
-        """The quantities of a state, by name."""
+    #: The quantities of a state, by name.
+    quantities: eqx.AbstractVar[dict[str, Quantity]]
+
+    #: The words for how a run ends, in the order of the integers in files.
+    words: eqx.AbstractVar[tuple[str, ...]]
+
+    #: The variables of a table that describe the end of a run.
+    ends: eqx.AbstractVar[dict[str, Variable]]
 
     @abc.abstractmethod
     def read(
@@ -195,19 +183,9 @@ class AbstractModel(eqx.Module):
         rows of its modes; `mode`: the indices of these modes, or `None`.
         """
 
-    @property
-    @abc.abstractmethod
-    def words(self) -> tuple[str, ...]:
-        """The words for how a run ends, in the order of the integers in files."""
-
     @abc.abstractmethod
     def ended(self, outcome: Outcome | HybridOutcome, tolerance: Number) -> Int[Array, " cells"]:
         """How each run has ended, as an integer of `Status`."""
-
-    @property
-    @abc.abstractmethod
-    def ends(self) -> dict[str, Variable]:
-        """The variables of a table that describe the end of a run."""
 
     @abc.abstractmethod
     def at_end(self, outcome: Outcome | HybridOutcome, start: Float[Array, "components cells"]) -> dict[str, Array]:
@@ -227,10 +205,8 @@ def statuses(codes: Int[Array, " cells"], left_domain: Any) -> Int[Array, " cell
 class AbstractSceneModel(AbstractModel):
     """A model whose parameters are those of a few named trees, such as a scene and a launch, and of a user's event."""
 
-    @property
-    @abc.abstractmethod
-    def roots(self) -> dict[str, PyTree]:
-        """The trees whose numbers are parameters, which are fields of the model."""
+    #: The trees whose numbers are parameters, which are fields of the model.
+    roots: eqx.AbstractVar[dict[str, PyTree]]
 
     @property
     def known_of_event(self) -> list[str]:

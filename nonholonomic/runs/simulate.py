@@ -1,7 +1,7 @@
 """Simulate one run of any model."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -80,28 +80,22 @@ def _followed(
     settings: Settings,
 ) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
     """The outcome of the runs, their `Status`, and the named quantities at the samples."""
-    options: Any = {"one_kernel": True, "read": _reader(cells, names), "dense": len(times) >= DENSE}
+
+    def read(cell: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> dict[str, Array]:
+        of_lanes = jax.tree.map(lambda leaf: leaf if _own_axis(leaf) is None else leaf[cell], cells)
+        return eqx.filter_vmap(
+            lambda model, states: model.read(names, jnp.full(len(states), jnp.nan), states.T, None),
+            in_axes=(_own_axis, -1),
+            out_axes=1,
+        )(of_lanes, states)
+
+    options: Any = {"one_kernel": True, "read": read, "dense": len(times) >= DENSE}
     outcome, samples = solve_with_samples(problem, times, t1, count, settings, **options)
     return outcome, cells.ended(outcome, settings.tolerance), samples
 
 
 def _own_axis(leaf: Any) -> int | None:
     return 0 if eqx.is_array(leaf) and leaf.ndim else None
-
-
-def _reader(
-    model: AbstractModel, names: tuple[str, ...]
-) -> Callable[[Int[Array, "*lanes"], Float[Array, "rows components *lanes"]], dict[str, Array]]:
-    """A function that computes the named quantities of some cells from their states."""
-
-    def read_lane(model: AbstractModel, states: Float[Array, "rows components"]) -> dict[str, Array]:
-        return model.read(names, jnp.full(len(states), jnp.nan), states.T, None)
-
-    def reader(cell: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> dict[str, Array]:
-        of_lanes = jax.tree.map(lambda leaf: leaf if _own_axis(leaf) is None else leaf[cell], model)
-        return eqx.filter_vmap(read_lane, in_axes=(_own_axis, -1), out_axes=1)(of_lanes, states)
-
-    return reader
 
 
 def modes_of_run(modules: tuple[AbstractModel, Names], tolerance: Array, cells: int) -> Start:

@@ -4,9 +4,10 @@ import abc
 import dataclasses
 import functools
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from ..integration.problem import Status, run_bounds
 from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
-from ..text import Unit, as_text, batch_title, distinguishing_labels, likely, readable_unit, require_unit, shown
+from ..text import Unit, as_text, distinguishing_labels, likely, readable_unit, require_unit, shown
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure
 from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
@@ -218,28 +219,24 @@ def live_run(
     def at(model: Any, values: Float[Array, " numbers"]) -> Any:
         return model.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
 
-    def answers(values: Array, problem: Any, ended: Any) -> tuple[Array, Array]:
-        return outcome(at(model, values), problem, ended)
-
-    def drawing(values: Array, mode: Any, rows: Array, time: Any) -> Frame:
-        return frame(at(drawn, values), time, rows, mode)
-
     if model.smooth:
         shown_motion = motion or (lambda drawn: drawn.problem(1, None))
+        outcomes: Any = {"outcome": lambda values, problem, lane: outcome(at(model, values), problem, lane)}
+        frames = {"frame": lambda values, problem, lane: frame(at(drawn, values), lane.time, lane.state, None)}
         ends_late = model.continues and model.has_event
-        answering: Any = Simulator(
-            lambda values: at(model, values).problem(1, ()), t1, settings, {"outcome": answers}, ends_late
-        )
-        frames = {"frame": lambda values, problem, lane: drawing(values, None, lane.state, lane.time)}
+        answering: Any = Simulator(lambda values: at(model, values).problem(1, ()), t1, settings, outcomes, ends_late)
         moving: Any = Simulator(lambda values: shown_motion(at(drawn, values)), t1, settings, frames)
     else:
         options = (t1, settings, len(model.counters))
-        outcomes = {"outcome": lambda values, runs: answers(values, None, runs)}
+        outcomes = {"outcome": lambda values, runs: outcome(at(model, values), None, runs)}
         answering = HybridSimulator(
             lambda values: at(model, values).modes(1, settings.tolerance, (), False), *options, outcomes
         )
         moving = HybridSimulator(
-            lambda values: at(drawn, values).modes(1, settings.tolerance, None, False), *options, {}, drawing
+            lambda values: at(drawn, values).modes(1, settings.tolerance, None, False),
+            *options,
+            {},
+            lambda values, mode, rows, time: frame(at(drawn, values), time, rows, mode),
         )
     result = Answer(*answer, answering, words or {})
     return LiveRun(title, sliders, lambda values: jnp.all(at(model, values).legal()), result, moving, summaries)
@@ -330,15 +327,11 @@ REASONS = {
 class AbstractRun(Viewable, Tabular, eqx.Module):
     """A run of any model at its times `t`, the first axis of its arrays; a batch has an axis before it."""
 
-    @property
-    @abc.abstractmethod
-    def of_page(self) -> tuple[AbstractModel, float]:
-        """The model of the run, and the end of the runs on its page [s]."""
+    #: The model of the run, and the end of the runs on its page [s].
+    of_page: eqx.AbstractVar[tuple[AbstractModel, float]]
 
-    @property
-    def codes(self) -> Int[Array, "..."] | str | None:
-        """How the runs of a batch ended, as integers of `Status`; `None` if this is unknown."""
-        return None
+    #: How the runs of a batch ended, as integers of `Status`; `None` if this is unknown.
+    codes: ClassVar[Any] = None
 
     @abc.abstractmethod
     def in_words(self) -> str:
@@ -364,8 +357,12 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
     def __str__(self) -> str:
         # A batch, or a run inside a transformation, has no single values to show.
         if is_traced((self.t, self.codes)) or np.ndim(self.t) != 1:
+            *batch, times = np.shape(self.t)
+            one = f"Trajectory of {times} times, inside a transformation"
+            runs = f"{math.prod(batch)} runs of {times} times" if batch else one
             codes = [] if self.codes is None or is_traced(self.codes) else np.ravel(self.codes)
-            return batch_title(np.shape(self.t), [Status(int(code)).word for code in codes])
+            counts = Counter(Status(int(code)).word for code in codes)
+            return ": ".join(filter(None, [runs, ", ".join(f"{count} {word}" for word, count in counts.items())]))
         return self.in_words()
 
 

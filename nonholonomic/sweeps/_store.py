@@ -196,16 +196,11 @@ def _values(group: "h5py.Group", name: str, box: tuple[slice, ...] = ()) -> Valu
     return np.asarray(array[box])
 
 
-def _attribute(node: "h5py.HLObject", name: str) -> Any:
-    """An attribute, a number or a string."""
+def _attribute(node: "h5py.HLObject", name: str, is_text: bool = False) -> Any:
+    """An attribute, a number or a string. **Arguments:** `is_text`: whether it must be a string."""
     value = node.attrs[name]
-    return value.decode() if isinstance(value, bytes) else value
-
-
-def _text(node: "h5py.HLObject", name: str) -> str:
-    """An attribute that is a string."""
-    value = _attribute(node, name)
-    if not isinstance(value, str):
+    value = value.decode() if isinstance(value, bytes) else value
+    if is_text and not isinstance(value, str):
         raise ValueError(f"the attribute {name} is not a text")
     return value
 
@@ -305,15 +300,15 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     for name in (*dict.fromkeys(dims), *(name for name in map(str, file) if name not in (*dims, CHECKSUMS))):
         array = cast("h5py.Dataset", file[name])
         if LONG_NAME in array.attrs:
-            long_names[name] = _text(array, LONG_NAME)
+            long_names[name] = _attribute(array, LONG_NAME, is_text=True)
         if "flag_meanings" in array.attrs:
-            meanings = _text(array, "flag_meanings").split()
+            meanings = _attribute(array, "flag_meanings", is_text=True).split()
             # Words of earlier versions are converted to current ones.
             words[name] = (
                 tuple(FORMER_WORDS.get(word, word) for word in meanings) if name == "status" else tuple(meanings)
             )
         else:
-            units[name] = _text(array, "units")
+            units[name] = _attribute(array, "units", is_text=True)
         if name in dims:
             coords[name] = _values(file, name)
             if coords[name].ndim != 1:

@@ -81,10 +81,14 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], max_in_fl
                 crash_count, results = 0, future.result()
             except CancelledError as error:
                 raise ExecutorBroken("the executor has cancelled its chunks") from error
+            except BrokenExecutor:
+                crash_count, results = 1, None
             except Exception as error:
-                crash_count, results = crashes_reported_by(error), None
-                if not crash_count:
+                distributed: Any = sys.modules.get("distributed")
+                if distributed is None or not isinstance(error, distributed.KilledWorker):
                     raise
+                # Dask has already given the chunk to other workers.
+                crash_count, results = 1 + error.allowed_failures, None
             was_last_try = crashes[chunk] >= MAX_CRASHES - 1
             crashes[chunk] += crash_count
             if crash_count and crashes[chunk] < MAX_CRASHES - 1:
@@ -99,15 +103,6 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], max_in_fl
     finally:
         for future in in_flight:
             future.cancel()
-
-
-def crashes_reported_by(error: Any) -> int:
-    """Number of workers that a chunk killed, according to the exception of its future."""
-    if isinstance(error, BrokenExecutor):
-        return 1
-    # Dask has already given the chunk to other workers.
-    distributed = sys.modules.get("distributed")
-    return 1 + error.allowed_failures if distributed is not None and isinstance(error, distributed.KilledWorker) else 0
 
 
 #: Greatest number of dispatched chunks: their results are in memory until they are stored.

@@ -147,7 +147,11 @@ class Viewable(abc.ABC):
             times = np.asarray(times, dtype=float)
             require_increasing(times, "times")
             request["times"] = times.tolist()
-        browser = require_browser()
+        if (browser := next(filter(None, map(shutil.which, BROWSERS)), None)) is None:
+            raise FileNotFoundError(
+                "animate needs Chromium, Chrome or Edge, and finds none: install one, for example by `apt install chromium` or "
+                "from google.com/chrome; or open the page of run.view(path) in any browser and press its button Save film"
+            )
         stages = self._stages(others, overlaid, unit)
         scripts = [script(RECORD.replace("[REQUEST]", json.dumps(request)))]
         html_page = page(
@@ -181,20 +185,6 @@ def require_others(run: object, others: Any, method: str) -> Sequence[Any]:
 
 
 # Films, recorded by a browser.
-
-
-def require_browser() -> str:
-    """The path of a browser that can record a page.
-
-    **Raises:** `FileNotFoundError` with what to install, if there is none.
-    """
-    paths = (shutil.which(name) for name in BROWSERS)
-    if (browser := next(filter(None, paths), None)) is None:
-        raise FileNotFoundError(
-            "animate needs Chromium, Chrome or Edge, and finds none: install one, for example by `apt install chromium` or "
-            "from google.com/chrome; or open the page of run.view(path) in any browser and press its button Save film"
-        )
-    return browser
 
 
 def recorded(html_page: Page, browser: str) -> bytes:

@@ -76,14 +76,6 @@ class Curve(NamedTuple):
     values: Float[np.ndarray, " times"]
     factor: float = 1.0
 
-    def drawn_in(self, unit: Unit) -> "Curve":
-        """The curve in another unit, if its label ends in a unit that can be converted. **Arguments:** as for `in_unit`."""
-        name, bracket, si = self.label.removesuffix("]").rpartition(" [")
-        if unit is None or not bracket:
-            return self
-        text, factor = in_unit(si, unit)
-        return self._replace(label=f"{name} [{text}]", factor=factor)
-
 
 class Show(NamedTuple):
     """The drawing of one run: `size` is a length [m] of the body, and `colour` the colour of its curves.
@@ -124,18 +116,25 @@ class Stage(NamedTuple):
 
 
 def curves_in(stages: list[Stage], unit: Unit) -> list[Stage]:
-    """The stages with their curves in other units, as for `in_unit`.
+    """The stages with their curves in other units, as for `in_unit`, if their labels end in a unit that can be converted.
 
     **Raises:** `ValueError` if no curve can be drawn in the unit.
     """
+    if unit is None:
+        return stages
     labels = dict.fromkeys(curve.label for stage in stages for show in stage.shows for curve in show.curves)
     parts = [label.removesuffix("]").partition(" [") for label in labels]
     require_unit_of(unit, {name: si or "1" for name, _, si in parts})
 
-    def drawn(show: Show) -> Show:
-        return show._replace(curves=tuple(curve.drawn_in(unit) for curve in show.curves))
+    def drawn(curve: Curve) -> Curve:
+        name, bracket, si = curve.label.removesuffix("]").rpartition(" [")
+        text, factor = in_unit(si, unit)
+        return curve._replace(label=f"{name} [{text}]", factor=factor) if bracket else curve
 
-    return [stage._replace(shows=tuple(map(drawn, stage.shows))) for stage in stages]
+    return [
+        stage._replace(shows=tuple(show._replace(curves=tuple(map(drawn, show.curves))) for show in stage.shows))
+        for stage in stages
+    ]
 
 
 #: Colours of a page's runs, for the curves, their numbers and one half of the body, with a contrast of 4.5 to 1 on white and to
