@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import DictKey, GetAttrKey, KeyPath, SequenceKey
+from jax.tree_util import DictKey
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .text import AbstractHeld, Numbers, gathered, likely, name_of, spread
@@ -224,26 +224,23 @@ def description(root: str, tree: PyTree) -> dict[str, Any]:
     fields: dict[str, Any] = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
-        fields |= description(name, value) if _is_described(value) else {name: _plain_data(value)}
+        is_module = isinstance(value, eqx.Module) and not isinstance(value, Numbers)
+        fields |= description(name, value) if is_module else {name: _plain_data(value)}
     return fields
-
-
-def _is_described(value: object) -> bool:
-    return isinstance(value, eqx.Module) and not isinstance(value, Numbers)
 
 
 def _plain_data(value: Any) -> Any:
     """A value as JSON can store it; other objects are described by their kind, because their text can be an address."""
+    if isinstance(value, jax.Array | np.ndarray | np.generic | Numbers):
+        return np.asarray(value).tolist()
     if isinstance(value, tuple | list):
         return [_plain_data(part) for part in value]
     if isinstance(value, dict):
         return {str(name): _plain_data(part) for name, part in value.items()}
-    if _is_described(value):
+    if isinstance(value, eqx.Module):
         return description("self", value)
     if value is None or isinstance(value, str | bool | int | float):
         return value
-    if isinstance(value, jax.Array | np.ndarray | np.generic | Numbers):
-        return np.asarray(value).tolist()
     return name_of(value)
 
 
@@ -298,7 +295,10 @@ class Parameters(eqx.Module):
         """The numbers of several named trees."""
         form, values = TreeForm.of(tree)
         leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, is_number))
-        names = [entry for path, leaf in leaves for entry in _entries(_name(path), np.shape(leaf))]
+        names: list[str] = []
+        for path, leaf in leaves:
+            parts = (f".{key.key}" if isinstance(key, DictKey) else str(key) for key in path)
+            names += _entries("".join(parts).removeprefix("."), np.shape(leaf))
         return cls(values, tuple(names), form)
 
     @property
@@ -321,15 +321,11 @@ class Parameters(eqx.Module):
         )
 
     @property
-    def movable(self) -> list[str]:
-        """The names of the numbers that are floats, which can be varied."""
-        return [name for name, value in zip(self.names, self.values, strict=True) if eqx.is_inexact_array(value)]
-
-    @property
     def known(self) -> list[str]:
-        """The names of the numbers that can be varied, one by one or in all modes that have them."""
-        merged_names = [of_all_modes(name) for name in self.movable]
-        return [*self.movable, *dict.fromkeys(name for name in merged_names if merged_names.count(name) > 1)]
+        """The names of the numbers that can be varied, the floats, one by one or in all modes that have them."""
+        floats = [name for name, value in zip(self.names, self.values, strict=True) if eqx.is_inexact_array(value)]
+        merged_names = [of_all_modes(name) for name in floats]
+        return [*floats, *dict.fromkeys(name for name in merged_names if merged_names.count(name) > 1)]
 
     def full_name(self, argument: str, name: str) -> str:
         """The full name for a name, as in `nonholonomic.parameters.full_name`.
@@ -351,19 +347,6 @@ class Parameters(eqx.Module):
                     return f"; {end} = {value} is an integer: write {float(value)}" if isinstance(value, int) else ""
                 return f"; declare it with its type in {type(module).__name__}: {end}: float = {float(value)}"
         return ""
-
-
-def _name(path: KeyPath) -> str:
-    """A path in the user's notation."""
-    parts = []
-    for key in path:
-        if isinstance(key, SequenceKey):
-            parts.append(f"[{key.idx}]")
-        elif isinstance(key, DictKey | GetAttrKey):
-            parts.append(f".{key.key if isinstance(key, DictKey) else key.name}")
-        else:
-            parts.append(str(key))
-    return "".join(parts).removeprefix(".")
 
 
 def of_all_modes(name: str) -> str:

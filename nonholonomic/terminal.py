@@ -79,7 +79,10 @@ class Progress:
                 self._inner = bool(outer)
                 if self._shown:
                     self._tqdm = bar_class()
-                _LINE.add(self)
+                _LINE.speakers.append(self)
+                if _LINE.writer is None or not _LINE.writer.is_alive():
+                    _LINE.writer = threading.Thread(target=_LINE.write, daemon=True)
+                    _LINE.writer.start()
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -135,16 +138,10 @@ class _Line:
 
     def __init__(self):
         self.lock, self.speakers = threading.RLock(), []
-        self._writer: threading.Thread | None = None
+        self.writer: threading.Thread | None = None
 
-    def add(self, speaker: Progress) -> None:
-        """Add a call that has something to show."""
-        self.speakers.append(speaker)
-        if self._writer is None or not self._writer.is_alive():
-            self._writer = threading.Thread(target=self._write, daemon=True)
-            self._writer.start()
-
-    def _write(self) -> None:
+    def write(self) -> None:
+        """Write the line whenever it is due, until nothing has been shown for a while."""
         last = time.time()
         while True:
             time.sleep(TICK)
@@ -152,7 +149,7 @@ class _Line:
                 if self.speakers:
                     last = time.time()
                 elif time.time() - last > LINGER:
-                    self._writer = None
+                    self.writer = None
                     return
                 due = [line for line in self.speakers if line._shown and time.time() - line._start >= INTERVAL]
                 owner = next((line for line in reversed(due) if line._total is not None), due[0] if due else None)

@@ -314,12 +314,6 @@ def one_line(module: PyTree, with_units: bool = True) -> str:
     return f"{type(module).__name__}({', '.join(f'{name}={text}' for name, text in contents(module, with_units))})"
 
 
-def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
-    """A title, followed by one line per row."""
-    width = max((len(name) for name, _ in rows), default=0)
-    return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
-
-
 def distinguishing_labels(
     starts: list[tuple[str, ...]], *groups: list[Any], unit: Unit = None, longest: int | None = MOST_CHARACTERS
 ) -> list[str]:
@@ -379,7 +373,7 @@ def as_html(title: str, rows: list[tuple[str, ...]]) -> str:
     return f"<div><b>{html.escape(title)}</b><table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table></div>"
 
 
-def text_as_html(text: str) -> str:
-    """A text whose first line is a title, as HTML for a notebook."""
-    title, _, body = text.partition("\n")
+def text_as_html(value: object) -> str:
+    """A value whose text begins with a title in a line of its own, as HTML for a notebook."""
+    title, _, body = str(value).partition("\n")
     return f"<div><b>{html.escape(title)}</b><pre>{html.escape(body)}</pre></div>"

@@ -27,7 +27,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .text import as_html, contents, in_lines, is_users, likely, likely_fix, one_line, shown
+from .text import as_html, contents, is_users, likely, likely_fix, one_line, shown
 
 # Warnings, which point to the user's line.
 
@@ -502,8 +502,11 @@ class Bounded(eqx.Module, metaclass=Explaining):
         return one_line(self, self._has_units)
 
     def __str__(self) -> str:
-        parts = any(isinstance(getattr(self, field.name, None), eqx.Module) for field in dataclasses.fields(self))
-        return in_lines(type(self).__name__, contents(self, self._has_units)) if parts else repr(self)
+        if not any(isinstance(getattr(self, field.name, None), eqx.Module) for field in dataclasses.fields(self)):
+            return repr(self)
+        rows = contents(self, self._has_units)
+        width = max(len(name) for name, _ in rows)
+        return "\n".join([type(self).__name__, *(f"  {name:{width}}  {text}" for name, text in rows)])
 
     def _repr_html_(self) -> str:
         return as_html(type(self).__name__, contents(self, self._has_units))

@@ -240,8 +240,7 @@ class Identification:
         valid = list(self.estimates)
         return valid.index(full_name("name", name, valid))
 
-    def _repr_html_(self) -> str:
-        return text_as_html(str(self))
+    _repr_html_ = text_as_html
 
     def __str__(self) -> str:
         lines = [

@@ -6,7 +6,7 @@ differentiated. If the function depends on time, a clock is added to the state.
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -165,9 +165,7 @@ class EventProblem(AbstractDerivedProblem):
     mode: AbstractBatchedMode | None = None
     index: int | None = eqx.field(static=True, default=None)
 
-    @property
-    def direction_decides(self) -> bool:
-        return True
+    direction_decides: ClassVar[bool] = True
 
     @property
     def fits_one_kernel(self) -> bool:

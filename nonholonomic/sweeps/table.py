@@ -659,5 +659,4 @@ class Tabular(abc.ABC):
     def __repr__(self) -> str:
         return str(self)
 
-    def _repr_html_(self) -> str:
-        return text_as_html(str(self))
+    _repr_html_ = text_as_html

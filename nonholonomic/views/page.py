@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -169,15 +169,11 @@ class _Numbers:
             self.parts[kind].append(flat)
         return self.places[key]
 
-    def mesh(self, mesh: Mesh) -> dict[str, object]:
-        """A mesh for the script."""
-        vertices, triangles = self.add(mesh.vertices), self.add(mesh.triangles, "<i4")
-        return {"vertices": vertices, "triangles": triangles, "colour": css(mesh.colour)}
-
-    def described(self, part: object) -> object:
+    def described(self, part: object) -> Any:
         """A part of a stage for the script: a named tuple by its fields, and arrays by their places."""
         if isinstance(part, Mesh):
-            return self.mesh(part)
+            vertices, triangles = self.add(part.vertices), self.add(part.triangles, "<i4")
+            return {"vertices": vertices, "triangles": triangles, "colour": css(part.colour)}
         if isinstance(part, Trace):
             part = part._replace(points=finite(part.points))
         elif isinstance(part, Arrow):
@@ -206,7 +202,7 @@ def _stage(stage: Stage, numbers: _Numbers) -> dict[str, object]:
         "size": max(show.size for show in stage.shows),
         "background": css(BACKGROUND),
         "lines": css(LINES),
-        "arena": numbers.mesh(stage.arena.mesh) | {"lines": [numbers.add(line) for line in stage.arena.lines]},
+        "arena": numbers.described(stage.arena.mesh) | {"lines": [numbers.add(line) for line in stage.arena.lines]},
         "runs": numbers.described(stage.shows),
     }
 

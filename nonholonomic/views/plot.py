@@ -105,9 +105,7 @@ def draw_table(
     drawing.set_xlabel(table.label(names[0]))
     cuts = [_cut_text(table, name, place, at.get(name)) for name, place in cut.items()]
     if len(names) == 1 or (y is None and len(table.coords[names[1]]) <= MOST_LINES):
-        _draw_lines(drawing, table, names, visible.reshape(len(visible), -1), label)
-        if not np.any(np.isfinite(visible)):
-            _say_why_it_is_empty(drawing, table.coords[names[0]], words)
+        _draw_lines(drawing, table, names, visible.reshape(len(visible), -1), label, words)
         drawing.set_ylabel(table.label(variable))
         if log:
             drawing.set_yscale("log")
@@ -120,15 +118,6 @@ def draw_table(
             _mark_words(drawing, table, names, np.where(np.isnan(visible), words, ""))
     drawing.set_title(", ".join(cuts), fontsize="medium")
     return drawing.figure if ax is None else ax
-
-
-def _say_why_it_is_empty(drawing: "Axes", values: np.ndarray, words: np.ndarray | None) -> None:
-    """Keep the abscissa of lines without any finite value, and count the statuses of their cells."""
-    if values.dtype.kind != "U" and len(values) > 1:
-        drawing.set_xlim(values.min(), values.max())
-    counts = [] if words is None else [f"{np.sum(words == word)} {word.replace('_', ' ')}" for word in np.unique(words)]
-    text = ": ".join(filter(None, ["nothing finite to draw", ", ".join(counts)]))
-    drawing.text(0.5, 0.5, text, transform=drawing.transAxes, ha="center", va="center")
 
 
 def _whole(dims: tuple[str, ...], name: str) -> str:
@@ -195,14 +184,25 @@ def _cut_text(table: "Table", name: str, place: int, wanted: float | None = None
     return text if is_near else f"{text} (nearest to {wanted:.4g})"
 
 
-def _draw_lines(drawing: "Axes", table: "Table", names: list[str], lines: np.ndarray, label: str | None) -> None:
-    marker = "o-" if len(lines) <= 100 else "-"
+def _draw_lines(
+    drawing: "Axes", table: "Table", names: list[str], lines: np.ndarray, label: str | None, words: np.ndarray | None
+) -> None:
+    """Draw a line for each column; without any finite value, count the statuses of the cells."""
+    marker, values = "o-" if len(lines) <= 100 else "-", table.coords[names[0]]
     for index, line in enumerate(lines.T):
         texts = [label or "", _cut_text(table, names[1], index) if len(names) > 1 else ""]
         text = ", ".join(filter(None, texts))
-        drawing.plot(table.coords[names[0]], line, marker, markersize=3, label=text or None)
+        drawing.plot(values, line, marker, markersize=3, label=text or None)
     if len(names) > 1 or label:
         drawing.legend()
+    if not np.any(np.isfinite(lines)):
+        # The abscissa stays that of the table.
+        if values.dtype.kind != "U" and len(values) > 1:
+            drawing.set_xlim(values.min(), values.max())
+        kinds = [] if words is None else np.unique(words)
+        counts = ", ".join(f"{np.sum(words == word)} {word.replace('_', ' ')}" for word in kinds)
+        text = ": ".join(filter(None, ["nothing finite to draw", counts]))
+        drawing.text(0.5, 0.5, text, transform=drawing.transAxes, ha="center", va="center")
 
 
 def _draw_map(drawing: "Axes", table: "Table", names: list[str], visible: np.ndarray, label: str, log: bool) -> None:
@@ -335,8 +335,14 @@ def draw_series(
         figure, panels = None, [ax]
     for panel, name in zip(panels, names, strict=True):
         for table, label in zip(tables, labels, strict=True):
-            lines, quantity = _lines(table, name)
-            colour = None
+            colour, dims = None, table.inner.get(name, ())
+            if len(dims) == 1 and table[dims[0]].dtype.kind == "U":
+                # All components of a vector.
+                lines = [(str(part), table[name][:, k]) for k, part in enumerate(table[dims[0]])]
+                quantity = table.label(name)
+            else:
+                values, quantity = column(table, "quantity", name, vectors=True)
+                lines = [("", values)]
             for (component, values), style in zip(lines, itertools.cycle(STYLES)):
                 text = ", ".join(part for part in (label, component) if part)
                 # A line without a text stays out of the legend.
@@ -349,15 +355,6 @@ def draw_series(
             panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=_columns(texts), fontsize="small")
     panels[-1].set_xlabel(tables[0].label("time"))
     return figure or panels[0]
-
-
-def _lines(table: "Table", name: str) -> tuple[list[tuple[str, np.ndarray]], str]:
-    """The components of a quantity with their values, and the label of the quantity."""
-    dims = table.inner.get(name, ())
-    if len(dims) == 1 and table[dims[0]].dtype.kind == "U":
-        return [(str(part), table[name][:, k]) for k, part in enumerate(table[dims[0]])], table.label(name)
-    values, label = column(table, "quantity", name, vectors=True)
-    return [("", values)], label
 
 
 def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> "Figure":

@@ -7,7 +7,7 @@ import pytest
 
 import stroller
 import tippe
-from nonholonomic.text import as_html, as_text, distinguishing_labels, in_lines, in_unit, readable_unit, text_as_html
+from nonholonomic.text import as_html, as_text, distinguishing_labels, in_unit, readable_unit, text_as_html
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,6 @@ def test_html_escapes_and_lines_are_aligned():
     assert "a &lt; b" in as_html("a < b", [("x", "<1>")])
     assert "&lt;1&gt;" in as_html("a", [("x", "<1>")])
     assert text_as_html("title\nx < 1").count("<pre>x &lt; 1</pre>") == 1
-    assert in_lines("T", [("a", "1"), ("long", "2")]) == "T\n  a     1\n  long  2"
 
 
 def test_runs_are_told_apart_by_what_differs():
