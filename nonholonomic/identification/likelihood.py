@@ -18,7 +18,7 @@ from ..validation import ArrayOrList, require
 
 # Only for type checkers: data stand above measurements.
 if TYPE_CHECKING:
-    from ..runs.identify import Data
+    from .recording import AbstractData
 
 # Compare predictions with measurements: residuals whose squares add up to -2 log likelihood.
 
@@ -392,7 +392,7 @@ Value = TypeVar("Value")
 EACH = "data[*]."
 
 
-def joined_data(data: Sequence["Data"]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
+def joined_data(data: Sequence["AbstractData"]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
     """The joined measurements of several sets of data, their labels, and the indices of the predictions that were measured.
 
     **Arguments:** `data`: sets of data, each with the attributes `measurements`, `labels`, `seen`, and `size` (the

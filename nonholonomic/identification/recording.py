@@ -93,11 +93,30 @@ def as_quantity(words: object) -> Any:
     return tuple(words) if isinstance(words, list) else words
 
 
+class AbstractData(eqx.Module):
+    """A set of data of a fit."""
+
+    #: Number of predictions, and the indices of those that were measured, ordered by time.
+    size: eqx.AbstractVar[int]
+    seen: eqx.AbstractVar[np.ndarray]
+
+    #: What was measured, and a label for each number.
+    measurements: eqx.AbstractVar[Measurements]
+    labels: eqx.AbstractVar[tuple[str, ...]]
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
+        """Labels for a picture, with numbers in other units if they have any."""
+        return self.labels
+
+
 #: Samples of a top or a stroller are usually closer together [s]; others may have times in milliseconds.
 FAR_APART = 5.0
 
 
-class AbstractRecording(eqx.Module):
+class AbstractRecording(AbstractData):
     """A recorded run: quantities sampled at the times of a clock.
 
     **Arguments:**
@@ -136,9 +155,6 @@ class AbstractRecording(eqx.Module):
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     side: str = eqx.field(static=True, default="before")
     units: ClassVar[dict[str, str]] = {"times": "s", "t0": "s"}
-
-    def __repr__(self) -> str:
-        return one_line(self)
 
     def __check_init__(self):
         if self.side not in ("before", "after"):
@@ -210,10 +226,6 @@ class AbstractRecording(eqx.Module):
         """A label for each sample, such as `theta(0.1 s)`; missing samples are omitted."""
         all_labels = [f"{column}({time:.4g} s)" for time in np.asarray(self.times) for column in self.columns]
         return tuple(all_labels[i] for i in self.seen)
-
-    def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
-        """Labels for a picture, which has the times below its curves."""
-        return self.labels
 
     def units_of(self, model: "AbstractModel") -> tuple[str, ...]:
         """The unit of each series, for the model of the run."""

@@ -17,13 +17,14 @@ from ..compilation.xla_cpu import greatest
 from ..identification import AbstractRecording, Free, Identification, LogDensity, Measurements, Quantities, as_quantity
 from ..identification.likelihood import free_numbers, joined_data, of_data, own_name
 from ..identification.posterior import Prior
+from ..identification.recording import AbstractData
 from ..identification.result import check_search
 from ..identification.result import identify as most_likely
 from ..integration import Settings
 from ..integration.problem import MOST_STEPS, tolerance_bound
 from ..parameters import full_name, require_apart
 from ..terminal import status_line
-from ..text import likely, one_line, shown
+from ..text import likely, shown
 from ..validation import as_number, as_number_or_none, nan_unless, require
 from .event import SILENT, time_of_event
 from .model import AbstractModel, check_run, model_of, require_event
@@ -90,7 +91,7 @@ class Recording(AbstractRecording):
 Cells = Float[np.ndarray, " cells"]
 
 
-class AbstractEventTimes(eqx.Module):
+class AbstractEventTimes(AbstractData):
     """Measured times of an event, in one series with a prediction for each.
 
     - `launch`: the start of the runs.
@@ -108,14 +109,8 @@ class AbstractEventTimes(eqx.Module):
     until: eqx.AbstractVar[Float[Array, "..."] | None]
     student: eqx.AbstractVar[Float[Array, ""] | None]
 
-    #: A label for each time.
-    labels: eqx.AbstractVar[tuple[str, ...]]
-
     #: Whether times through several modes come from the programs of tables, which is faster for flights in closed form.
     by_tables: ClassVar[bool] = False
-
-    def __repr__(self) -> str:
-        return one_line(self)
 
     def __check_init__(self):
         shape = np.shape(self.time)
@@ -184,10 +179,6 @@ class AbstractEventTimes(eqx.Module):
     def of_ends(self, model: AbstractModel, t1: Cells, time: Cells, ends: dict[str, Float[Array, " cells"]]) -> Cells:
         """The predictions from a table: from the times of events, infinite without an event, and the ends of the runs."""
         return time
-
-    def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
-        """Labels for a picture, with numbers in other units."""
-        return self.labels
 
     @property
     def horizon(self) -> Float[Array, ""]:
@@ -606,7 +597,7 @@ def prepared(
     **Raises:** `ValueError` unless there is at least one set of data, and all sets are recordings or times of events.
     """
     several: tuple[Any, ...] = tuple(data) if isinstance(data, list | tuple) else (data,)
-    if not several or not all(isinstance(source, AbstractRecording | AbstractEventTimes) for source in several):
+    if not several or not all(isinstance(source, AbstractData) for source in several):
         reader = "; read a file with read_recording" if isinstance(data, str | Path) else ""
         raise ValueError(f"data = {shown(data)} must be {expected}, or a list of them{reader}")
     tolerance_bound(tolerance).require()
