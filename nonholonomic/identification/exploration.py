@@ -252,11 +252,11 @@ def range_of(name: str, unknown: Unknown, prior: Any, spread: float, duration: f
     **Arguments:** `prior`: as in `LogDensity`, or `None`; `spread`: greater than 1; `duration`: of the longest recording [s],
     0 if there is none.
     """
-    kind, middle, is_gaussian = own_name(name), float(unknown.start), prior is not None and not callable(prior)
-    if unknown.has_lower and unknown.has_upper and not is_gaussian:
+    kind, middle, gaussian = own_name(name), float(unknown.start), None if callable(prior) else prior
+    if unknown.has_lower and unknown.has_upper and gaussian is None:
         return -5.0, 5.0
-    if is_gaussian:
-        middle, reach = float(prior[0]), DEVIATIONS * float(prior[1])
+    if gaussian is not None:
+        middle, reach = float(gaussian[0]), DEVIATIONS * float(gaussian[1])
     elif kind == "t0" and duration > 0.0:
         reach = OF_DURATION * duration
     elif kind.startswith(("launch", "start")):

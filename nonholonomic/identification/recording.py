@@ -97,12 +97,12 @@ class AbstractData(eqx.Module):
     """A set of data of a fit."""
 
     #: Number of predictions, and the indices of those that were measured, ordered by time.
-    size: eqx.AbstractVar[int]
-    seen: eqx.AbstractVar[np.ndarray]
+    size: ClassVar[int]
+    seen: ClassVar[np.ndarray]
 
     #: What was measured, and a label for each number.
-    measurements: eqx.AbstractVar[Measurements]
-    labels: eqx.AbstractVar[tuple[str, ...]]
+    measurements: ClassVar[Measurements]
+    labels: ClassVar[tuple[str, ...]]
 
     def __repr__(self) -> str:
         return one_line(self)

@@ -542,5 +542,5 @@ def _improved(problem: Problem, minima: Minima, sample: Weighted, max_steps: int
     place = np.arange(len(minima.starts))
     place[rows] = len(place) + np.arange(count)
     pair = minima.weighed(problem, later.measurements)[1:4], later[1:4]
-    ends = jax.tree.map(lambda old, new: np.concatenate([old, new])[place], *pair)
-    return Minima(minima.starts, *ends, later.measurements)
+    coordinates, converged, linearised = jax.tree.map(lambda old, new: np.concatenate([old, new])[place], *pair)
+    return Minima(minima.starts, coordinates, converged, linearised, later.measurements)

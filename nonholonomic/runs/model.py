@@ -54,10 +54,12 @@ class AbstractModel(eqx.Module):
     #: The names that choose a layout in which states of nearby runs can be compared.
     comparable: ClassVar[Names] = ()
 
+    # Every model has the attributes that are declared below, as properties or for its class.
+
     # The parameters by name.
 
     #: The full names of the parameters; those of the start begin with "start" or "launch".
-    known: eqx.AbstractVar[list[str]]
+    known: ClassVar[list[str]]
 
     @abc.abstractmethod
     def full_name(self, argument: str, name: str) -> str:
@@ -106,8 +108,8 @@ class AbstractModel(eqx.Module):
     # The motion.
 
     #: Whether a run is a single mode without a reset map, and whether there is an event.
-    smooth: eqx.AbstractVar[bool]
-    has_event: eqx.AbstractVar[bool]
+    smooth: ClassVar[bool]
+    has_event: ClassVar[bool]
 
     #: Further variables of a table that are times: name -> (description, the model with its event).
     further_times: ClassVar[dict[str, tuple[str, Any]]] = {}
@@ -165,13 +167,13 @@ class AbstractModel(eqx.Module):
     # What a state means.
 
     #: The quantities of a state, by name.
-    quantities: eqx.AbstractVar[dict[str, Quantity]]
+    quantities: ClassVar[dict[str, Quantity]]
 
     #: The words for how a run ends, in the order of the integers in files.
-    words: eqx.AbstractVar[tuple[str, ...]]
+    words: ClassVar[tuple[str, ...]]
 
     #: The variables of a table that describe the end of a run.
-    ends: eqx.AbstractVar[dict[str, Variable]]
+    ends: ClassVar[dict[str, Variable]]
 
     @abc.abstractmethod
     def read(
@@ -206,7 +208,7 @@ class AbstractSceneModel(AbstractModel):
     """A model whose parameters are those of a few named trees, such as a scene and a launch, and of a user's event."""
 
     #: The trees whose numbers are parameters, which are fields of the model.
-    roots: eqx.AbstractVar[dict[str, PyTree]]
+    roots: ClassVar[dict[str, PyTree]]
 
     @property
     def known_of_event(self) -> list[str]:

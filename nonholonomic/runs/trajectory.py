@@ -328,7 +328,7 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
     """A run of any model at its times `t`, the first axis of its arrays; a batch has an axis before it."""
 
     #: The model of the run, and the end of the runs on its page [s].
-    of_page: eqx.AbstractVar[tuple[AbstractModel, float]]
+    of_page: ClassVar[tuple[AbstractModel, float]]
 
     #: How the runs of a batch ended, as integers of `Status`; `None` if this is unknown.
     codes: ClassVar[Any] = None

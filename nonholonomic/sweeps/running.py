@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -84,11 +84,11 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], max_in_fl
             except BrokenExecutor:
                 crash_count, results = 1, None
             except Exception as error:
-                distributed: Any = sys.modules.get("distributed")
+                failure, distributed = cast(Any, error), sys.modules.get("distributed")
                 if distributed is None or not isinstance(error, distributed.KilledWorker):
                     raise
                 # Dask has already given the chunk to other workers.
-                crash_count, results = 1 + error.allowed_failures, None
+                crash_count, results = 1 + failure.allowed_failures, None
             was_last_try = crashes[chunk] >= MAX_CRASHES - 1
             crashes[chunk] += crash_count
             if crash_count and crashes[chunk] < MAX_CRASHES - 1:
