@@ -58,11 +58,9 @@ def gathered(numbers: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> lis
 
 def parted(tree: PyTree) -> PyTree:
     """A tree with `Numbers` in place of its arrays, which hold the numbers of a single run."""
-
-    def part(leaf: PyTree) -> PyTree:
-        return Numbers(spread([jnp.asarray(leaf)]), leaf.shape) if is_array(leaf) and leaf.ndim else leaf
-
-    return jax.tree.map(part, tree)
+    return jax.tree.map(
+        lambda leaf: Numbers(spread([jnp.asarray(leaf)]), leaf.shape) if is_array(leaf) and leaf.ndim else leaf, tree
+    )
 
 
 def joined(tree: PyTree) -> PyTree:

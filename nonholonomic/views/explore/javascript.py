@@ -15,7 +15,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike
 
 from ...compilation.components import AbstractScalarReader, rows_along
 from ...compilation.xla_cpu import Equation, called_program, opened, programs_of, traced
@@ -155,8 +154,7 @@ class _Block(AbstractScalarReader):
                 blocks.append(lines)
         return [line for lines in reversed(blocks) for line in lines], names
 
-    def constants(self, array: ArrayLike) -> Value:
-        return _value(array)
+    constants = staticmethod(_value)
 
     def apply(self, equation: Equation, inputs: Values) -> Sequence[Value]:
         name, parameters = equation.primitive.name, equation.params

@@ -299,9 +299,6 @@ class HybridSimulator(NamedTuple):
             state_after, following = mode_of(values, runs).hop(stretch, _left(t1, runs))
             return following.open, state_after.elapsed, following
 
-        def closed(values: Numbers, runs: HybridOutcome, stretch: PyTree) -> HybridOutcome:
-            return after_reset(runs, mode_of(values, runs).closed(stretch), t1)
-
         def between(values: Numbers, runs: HybridOutcome, stretch: PyTree, elapsed: Array) -> PyTree:
             mode = mode_of(values, runs)
             return mode.between(mode.motion_in(stretch), elapsed)
@@ -315,7 +312,10 @@ class HybridSimulator(NamedTuple):
             stretch = eqx.filter_eval_shape(lost, values, runs)[2]
             facts |= {"stretch": size_of(stretch), "most_hops": mode.most_hops}
             functions |= {"lost": (lost, (values, runs)), "hop": (hop, (values, runs, stretch))}
-            functions["closed"] = (closed, (values, runs, stretch))
+            functions["closed"] = (
+                lambda values, runs, stretch: after_reset(runs, mode_of(values, runs).closed(stretch), t1),
+                (values, runs, stretch),
+            )
             if self.frame is not None:
                 functions["between"] = (between, (values, runs, stretch, runs.end_time))
         if self.frame is not None:
