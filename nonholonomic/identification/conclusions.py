@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from .exploration import FARTHEST, ROWS, Explorer, Mixture, Weighted, fitted, squared_distances, weighted_covariance
 from .likelihood import Measurements
-from .posterior import Problem, deviances, predictions
+from .posterior import Coordinates, Matrix, PerPoint, Points, Problem, deviances, predictions
 from .search import SAME, Minima, minimise
 
 # Only for type checkers: results stand above conclusions.
@@ -167,7 +167,7 @@ def judge(
     )
 
 
-def normal_scores(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def normal_scores(measurements: Measurements, prediction: PerPoint) -> PerPoint:
     """Residuals converted to numbers that are normal if the stated errors are right; 0 for limits."""
     from scipy.stats import norm, t
 
@@ -177,7 +177,7 @@ def normal_scores(measurements: Measurements, prediction: Float[np.ndarray, " n"
     return np.where(heavy, np.sign(z) * norm.isf(t.sf(np.abs(z), np.where(heavy, freedom, 1.0))), z)
 
 
-def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
+def runs_of_signs(values: PerPoint) -> Series:
     """The number of runs of one sign in a series, and the probability of at most so many runs (Wald and Wolfowitz, Ann.
     Math. Stat. 11 (1940) 147).
 
@@ -314,15 +314,13 @@ class Distribution(NamedTuple):
     """
 
     kind: str
-    estimate: Float[np.ndarray, " unknowns"]
-    covariance: Float[np.ndarray, "unknowns unknowns"]
-    points: Float[np.ndarray, "n unknowns"]
-    weights: Float[np.ndarray, " n"]
+    estimate: Coordinates
+    covariance: Matrix
+    points: Points
+    weights: PerPoint
 
     @classmethod
-    def of(
-        cls, best: Float[np.ndarray, " unknowns"], by_slopes: Float[np.ndarray, "unknowns unknowns"], sample: Weighted
-    ) -> "Distribution":
+    def of(cls, best: Coordinates, by_slopes: Matrix, sample: Weighted) -> "Distribution":
         """The distribution for the most likely coordinates, their covariance by slopes, and a weighted sample."""
         points, weights = sample.pool.points, sample.weights
         if not np.all(np.isfinite(by_slopes)):
@@ -338,7 +336,7 @@ class Distribution(NamedTuple):
         mean, covariance = weighted_covariance(points, weights)
         root = np.linalg.cholesky(covariance)
 
-        def squares_from_mean(coordinates: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
+        def squares_from_mean(coordinates: Points) -> PerPoint:
             return np.sum(np.linalg.solve(root, (coordinates - mean).T) ** 2, axis=0)
 
         if squares_from_mean(best[None])[0] > AT_MEAN**2:
@@ -356,9 +354,7 @@ class Distribution(NamedTuple):
         low, high = quantiles(self.points[:, k], self.weights, np.array([0.5 * outside, 1.0 - 0.5 * outside]))
         return float(low), float(high)
 
-    def covariance_of_values(
-        self, problem: Problem, slopes: Float[np.ndarray, " unknowns"]
-    ) -> Float[np.ndarray, "unknowns unknowns"]:
+    def covariance_of_values(self, problem: Problem, slopes: Coordinates) -> Matrix:
         """The covariance of the parameters themselves, whose slopes with respect to the coordinates are given.
 
         The standard error of a parameter is half the width of its 68 % interval, which is the standard deviation of a normal
@@ -377,7 +373,7 @@ class Distribution(NamedTuple):
 
 
 def quantiles(
-    values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], shares: Float[np.ndarray, " shares"]
+    values: PerPoint, weights: PerPoint, shares: Float[np.ndarray, " shares"]
 ) -> Float[np.ndarray, " shares"]:
     """Quantiles of weighted values."""
     order = np.argsort(values)
@@ -426,9 +422,7 @@ class Minimum(NamedTuple):
         return f"{values} (weight {self.weight:.2f})"
 
 
-def divided(
-    points: Float[np.ndarray, "n unknowns"], weights: Float[np.ndarray, " n"], random: np.random.Generator
-) -> Int[np.ndarray, " n"]:
+def divided(points: Points, weights: PerPoint, random: np.random.Generator) -> Int[np.ndarray, " n"]:
     """The index of the minimum to which each point belongs.
 
     Components of a mixture are merged where the ridge between them has no deep saddle (Ray and Lindsay, Ann. Stat. 33
@@ -450,7 +444,7 @@ def divided(
     return np.array(parent)[np.argmax(_log_normals(mixture, points), axis=0)]
 
 
-def _log_normals(mixture: Mixture, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, "components n"]:
+def _log_normals(mixture: Mixture, points: Points) -> Float[np.ndarray, "components n"]:
     """The log densities of Gaussian components, weighted by their shares, up to a constant."""
     squares, log_volumes = squared_distances(points, mixture.centres, mixture.roots)
     return (np.log(mixture.shares) - log_volumes)[:, None] - 0.5 * squares
@@ -519,7 +513,7 @@ def without_prediction(
 
 
 def remarks(
-    explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: Float[np.ndarray, "unknowns unknowns"]
+    explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: Matrix
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is special about the shape of a posterior: concerns and notes, in words."""
     problem, region, weights = explorer.density.problem, explorer.region, sample.weights

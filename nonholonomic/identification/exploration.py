@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..terminal import Progress
 from .likelihood import Measurements, Unknown, own_name
-from .posterior import LogDensity, compared
+from .posterior import Coordinates, LogDensity, Matrix, PerPoint, Points, Rows, compared
 
 # The likelihood of measurements whose errors are unknown: the mean over the errors, with a flat prior of their
 # logarithms.
@@ -106,7 +106,7 @@ class Mixture(NamedTuple):
         stretch = np.sqrt(FREEDOM / random.chisquare(FREEDOM, count))
         return self.centres[which] + np.einsum("nij,nj->ni", self.roots[which], normal) * stretch[:, None]
 
-    def log_density(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
+    def log_density(self, points: Points) -> PerPoint:
         """The log density of the mixture."""
         size = points.shape[1]
         constant = (
@@ -123,21 +123,14 @@ class Mixture(NamedTuple):
         return Mixture(shares, np.concatenate([self.centres, other.centres]), np.concatenate([self.roots, other.roots]))
 
 
-def weighted_covariance(
-    points: Float[np.ndarray, "n unknowns"], weights: Float[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " unknowns"], Float[np.ndarray, "unknowns unknowns"]]:
+def weighted_covariance(points: Points, weights: PerPoint) -> tuple[Coordinates, Matrix]:
     """The mean and the covariance of weighted points."""
     mean = weights @ points
     off = points - mean
     return mean, (off * weights[:, None]).T @ off
 
 
-def fitted(
-    points: Float[np.ndarray, "n unknowns"],
-    weights: Float[np.ndarray, " n"],
-    components: int,
-    random: np.random.Generator,
-) -> Mixture:
+def fitted(points: Points, weights: PerPoint, components: int, random: np.random.Generator) -> Mixture:
     """The mixture that best fits weighted points: expectation maximisation of a Gaussian mixture, whose covariances
     become scale matrices.
 
@@ -180,7 +173,7 @@ def fitted(
 
 
 def squared_distances(
-    points: Float[np.ndarray, "n unknowns"],
+    points: Points,
     centres: Float[np.ndarray, "components unknowns"],
     roots: Float[np.ndarray, "components unknowns unknowns"],
 ) -> tuple[Float[np.ndarray, "components n"], Float[np.ndarray, " components"]]:
@@ -211,8 +204,8 @@ FARTHEST = 10.0
 class Region(NamedTuple):
     """A box in the coordinates: the middle and the half widths of the search, each (unknowns,)."""
 
-    middle: Float[np.ndarray, " unknowns"]
-    half_width: Float[np.ndarray, " unknowns"]
+    middle: Coordinates
+    half_width: Coordinates
 
     def points(self, count: int, seed: int) -> Float[np.ndarray, "count unknowns"]:
         """Quasi-random points that fill the box, `count` a power of two; the first is the middle."""
@@ -224,12 +217,12 @@ class Region(NamedTuple):
         unit[0] = 0.5
         return self.middle + (2.0 * unit - 1.0) * self.half_width
 
-    def log_density(self, points: Float[np.ndarray, "n unknowns"]) -> Float[np.ndarray, " n"]:
+    def log_density(self, points: Points) -> PerPoint:
         """The log density of points that are uniform in the box."""
         inside = np.all(np.abs(points - self.middle) <= self.half_width, axis=1)
         return np.where(inside, -np.sum(np.log(2.0 * self.half_width)), -np.inf)
 
-    def contains(self, points: Float[np.ndarray, "n unknowns"]) -> np.ndarray:
+    def contains(self, points: Points) -> np.ndarray:
         """Which points are near enough for a weight."""
         return np.all(np.abs(points - self.middle) <= FARTHEST * self.half_width, axis=1)
 
@@ -314,13 +307,13 @@ class Pool(NamedTuple):
     - `proposals`: pairs of a number of points and the distribution from which they were drawn.
     """
 
-    points: Float[np.ndarray, "n unknowns"]
+    points: Points
     predictions: Float[np.ndarray, "n measurements"]
     groups: Float[np.ndarray, "n groups"]
-    log_prior: Float[np.ndarray, " n"]
-    log_density: Float[np.ndarray, " n"]
-    log_region: Float[np.ndarray, " n"]
-    log_proposal: Float[np.ndarray, " n"]
+    log_prior: PerPoint
+    log_density: PerPoint
+    log_region: PerPoint
+    log_proposal: PerPoint
     proposals: tuple[tuple[int, Region | Mixture], ...]
 
     def candidates(self, count: int) -> Float[np.ndarray, "count unknowns"]:
@@ -340,7 +333,7 @@ class Pool(NamedTuple):
         """The numbers of the points with the greatest density, the best first."""
         return np.argsort(-self.log_density)[:count]
 
-    def log_weights(self, progress: float) -> Float[np.ndarray, " n"]:
+    def log_weights(self, progress: float) -> PerPoint:
         """Log weights of the points. With `progress` from 0 to 1, the powers of the measurements grow from 0 to 1, and the
         region of the search loses its weight; from 1 to 2, guessed errors become unknown errors."""
         if progress >= 2.0:
@@ -408,7 +401,7 @@ class Explorer(NamedTuple):
         is_same = np.all((others == base) | (change < NO_CHANGE), axis=(0, 2))
         return ~is_same | self.density.proper
 
-    def extended(self, pool: Pool, points: Float[np.ndarray, "rows unknowns"], proposal: Region | Mixture) -> Pool:
+    def extended(self, pool: Pool, points: Rows, proposal: Region | Mixture) -> Pool:
         """The pool with points that were drawn from a proposal."""
         predictions, each, prior, log_density = self.evaluated(points)
         groups = np.stack([np.sum(each[:, self.group == k], axis=1) for k in range(pool.groups.shape[1])], axis=1)
@@ -454,9 +447,7 @@ class Explorer(NamedTuple):
         mixture = halves[0].joined(halves[1], 0.5)
         return mixture if minima is None else mixture.joined(minima, share)
 
-    def evaluated(
-        self, points: Float[np.ndarray, "rows unknowns"]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def evaluated(self, points: Rows) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Predictions, log likelihoods of all measurements, log priors and log densities of at most `ROWS` points.
 
         The likelihood of a measurement is that with its stated or guessed error; the density is averaged over unknown errors.
@@ -483,7 +474,7 @@ class Weighted(NamedTuple):
     """
 
     pool: Pool
-    weights: Float[np.ndarray, " n"]
+    weights: PerPoint
     k: float
     effective: float
 
@@ -499,12 +490,12 @@ class Weighted(NamedTuple):
         return self.effective >= ENOUGH and self.k < MOST_K
 
 
-def effective_number(weights: Float[np.ndarray, " n"]) -> float:
+def effective_number(weights: PerPoint) -> float:
     """Number of independent draws that are worth as much as weighted ones (Kish)."""
     return float(1.0 / np.sum(weights**2))
 
 
-def independent_number(points: Float[np.ndarray, "n unknowns"], weights: Float[np.ndarray, " n"]) -> float:
+def independent_number(points: Points, weights: PerPoint) -> float:
     """Number of independent draws that are worth as much as weighted points.
 
     The points of a single unknown are spread evenly, so that chance is left only in the differences of neighbouring weights
@@ -518,10 +509,10 @@ def independent_number(points: Float[np.ndarray, "n unknowns"], weights: Float[n
     return max(number, min(EVEN * number, 1.0 / max(float(np.sum(differences**2)), 1e-300)))
 
 
-def tempered_weights(pool: Pool, least: float, power: float) -> Float[np.ndarray, " n"]:
+def tempered_weights(pool: Pool, least: float, power: float) -> PerPoint:
     """Weights of a power of the density, as close to the posterior as at least so many effective draws allow."""
 
-    def weights_at(progress: float) -> Float[np.ndarray, " n"]:
+    def weights_at(progress: float) -> PerPoint:
         # The density is flatter, the distribution of the points is what it is.
         logs = power * (pool.log_weights(progress) + pool.log_proposal) - pool.log_proposal
         logs = np.where(np.isfinite(logs), logs, -np.inf)
@@ -543,7 +534,7 @@ def tempered_weights(pool: Pool, least: float, power: float) -> Float[np.ndarray
 # Pareto-smoothed importance weights (Vehtari, Simpson, Gelman, Yao and Gabry, J. Mach. Learn. Res. 25 (2024) 72).
 
 
-def smoothed_weights(log_weights: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], float]:
+def smoothed_weights(log_weights: PerPoint) -> tuple[PerPoint, float]:
     """Normalised weights whose largest values are replaced by quantiles of a generalised Pareto distribution.
 
     **Arguments:** `log_weights`: (n,), -inf for weights that are 0.
@@ -567,7 +558,7 @@ def smoothed_weights(log_weights: Float[np.ndarray, " n"]) -> tuple[Float[np.nda
     return weights / np.sum(weights), float(shape)
 
 
-def _generalised_pareto(excess: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _generalised_pareto(excess: PerPoint) -> tuple[float, float]:
     """Shape and scale of a generalised Pareto distribution of increasing numbers (Zhang and Stephens, Technometrics 51
     (2009) 316), with the shape drawn to 0.5 like 10 of the numbers."""
     count = len(excess)

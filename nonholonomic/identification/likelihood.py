@@ -141,11 +141,7 @@ class Measurements(eqx.Module):
         of_value = jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
         residuals = jnp.select(
             [~self.censored, two_limits, low],
-            [
-                of_value,
-                between((finite_prediction - middle) / self.error, half),
-                one_sided(excess),
-            ],
+            [of_value, between((finite_prediction - middle) / self.error, half), one_sided(excess)],
             -one_sided(shortfall),
         )
         is_exceeded = low & ~high & (prediction == jnp.inf)

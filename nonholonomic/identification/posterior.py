@@ -19,7 +19,12 @@ from .likelihood import Free, Measurements, Unknown, as_free, as_gaussian
 
 # A model with its free parameters, and predictions with slopes, for many sets of parameters at once.
 
+#: Coordinates of one point, of a point for each row, and of n points; a number for each of n points; and a covariance.
+Coordinates = Float[np.ndarray, " unknowns"]
 Rows = Float[np.ndarray, "rows unknowns"]
+Points = Float[np.ndarray, "n unknowns"]
+PerPoint = Float[np.ndarray, " n"]
+Matrix = Float[np.ndarray, "unknowns unknowns"]
 
 #: Number of rows in a call of a model without and with slopes; on an accelerator.
 ROWS_OF_CALL, ROWS_WITH_SLOPES, MOST_ROWS = 64, 8, 512
@@ -68,7 +73,7 @@ class Problem(eqx.Module):
         stack: Any = np.stack if isinstance(coordinates, np.ndarray) else jnp.stack
         return stack([unknown.value(coordinates[..., k]) for k, unknown in enumerate(self.unknowns)], axis=-1)
 
-    def slopes(self, coordinates: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, " unknowns"]:
+    def slopes(self, coordinates: Coordinates) -> Coordinates:
         """The slopes of the parameters with respect to their coordinates."""
         pairs = zip(coordinates, self.unknowns, strict=True)
         return np.array([float(jax.grad(unknown.value)(coordinate)) for coordinate, unknown in pairs])
@@ -391,7 +396,7 @@ class LogDensity(eqx.Module):
             return jnp.asarray(self.predictions(np.asarray(coordinates)))
         return self.problem.predict(coordinates[:, : len(self.problem.names)])
 
-    def predictions(self, coordinates: Float[np.ndarray, "rows unknowns"]) -> Float[np.ndarray, "rows n"]:
+    def predictions(self, coordinates: Rows) -> Float[np.ndarray, "rows n"]:
         """The predictions of the model as NumPy arrays, also of a model that cannot be traced; NaN for NaN.
 
         **Raises:** `ValueError` if the model does not return one prediction per measurement.
@@ -402,7 +407,7 @@ class LogDensity(eqx.Module):
             raise ValueError(f"model must predict {shape} for {shape[0]} sets, not {prediction.shape}")
         return prediction
 
-    def log_priors(self, coordinates: Float[np.ndarray, "rows unknowns"]) -> Float[np.ndarray, " rows"]:
+    def log_priors(self, coordinates: Rows) -> Float[np.ndarray, " rows"]:
         """The log density of the priors in the coordinates, in every row."""
         return np.asarray(_log_priors(self.problem.unknowns, self._priors_in_order, coordinates))
 

@@ -114,11 +114,7 @@ def minimise(
 
 def chosen(improves: Bool[np.ndarray, " rows"], new: PyTree, old: PyTree) -> PyTree:
     """The new rows of all arrays where they are better, the old ones elsewhere."""
-    return jax.tree.map(
-        lambda new, old: np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old),
-        new,
-        old,
-    )
+    return jax.tree.map(lambda new, old: np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old), new, old)
 
 
 def _step(
