@@ -119,7 +119,6 @@ class Identification:
     distribution: Distribution = dataclasses.field(repr=False)
     problem: Problem = dataclasses.field(repr=False)
     measurements: Measurements = dataclasses.field(repr=False)
-    explorer: Explorer = dataclasses.field(repr=False)
     series_units: tuple[str, ...] = ()
     units: dict[str, str] = dataclasses.field(default_factory=dict)
     profiles: dict[int, Profile] = dataclasses.field(default_factory=dict, repr=False)
@@ -319,7 +318,6 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         distribution=distribution,
         problem=problem,
         measurements=measurements,
-        explorer=explorer,
     )
 
 
