@@ -99,28 +99,22 @@ class Progress:
             return
         self._written = time.time()
         compiling = is_making_programs(self._caller)
-        if self._bar is None:
-            self._bar = self._line()
-        if self._since is None:
-            self._bar.set_description_str("compiling" if compiling else self._doing, refresh=False)
-        else:
-            self._bar.set_description("compiling" if compiling else None, refresh=False)
-        self._bar.refresh()
-
-    def _line(self) -> Any:
-        """The line in its present state, not yet written."""
         # Without a delay, tqdm writes the line before everything in it is known.
         options = {"delay": 1e-9, "leave": self._since is not None and not self._inner}
         if self._since is None:
-            bar = self._tqdm(bar_format="{desc} [{elapsed}]", **options)
-            bar.start_t = self._start
-            return bar
-        # The rate is that of the whole run without the preparations, because chunks of items differ in cost.
-        bar = self._tqdm(total=self._total, initial=self._first, unit=self._unit, smoothing=0, **options)
-        bar.start_t = self._since
-        bar.n = self._done
-        bar.set_postfix(self._notes, refresh=False)
-        return bar
+            if self._bar is None:
+                self._bar = self._tqdm(bar_format="{desc} [{elapsed}]", **options)
+                self._bar.start_t = self._start
+            self._bar.set_description_str("compiling" if compiling else self._doing, refresh=False)
+        else:
+            if self._bar is None:
+                # The rate is that of the whole run without the preparations, because chunks of items differ in cost.
+                counts = {"total": self._total, "initial": self._first, "unit": self._unit, "smoothing": 0}
+                self._bar = self._tqdm(**counts, **options)
+                self._bar.start_t, self._bar.n = self._since, self._done
+                self._bar.set_postfix(self._notes, refresh=False)
+            self._bar.set_description("compiling" if compiling else None, refresh=False)
+        self._bar.refresh()
 
     def _clear(self) -> None:
         """Remove the line until it is written again."""

@@ -405,9 +405,17 @@ class TextTable(NamedTuple):
             first = unit = None
         unit = of_header if unit is None else unit
         if unit is None:
-            raise ValueError(
-                f"{argument}: {name!r} = {shown(header_and_unit)} must be {self._expected(argument, si, first)}"
+            known = "deg" if si == "rad" else next(iter(UNITS[si]))
+            expected = (
+                f"(header, unit), such as ('tilt', {known!r}), or a header with its unit, such as 'tilt [{known}]'"
             )
+            if argument == "error":
+                expected = f"(standard error, unit), such as (1.0, {known!r}), or (header of a column of standard errors, unit)"
+            if first is not None:
+                expected = (
+                    f"(header, unit), such as ({first!r}, {known!r}), because the header has no unit that is known"
+                )
+            raise ValueError(f"{argument}: {name!r} = {shown(header_and_unit)} must be {expected}")
         if not isinstance(unit, str):
             require(unit, f"unit of {name}")
             return first, float(unit)
@@ -441,15 +449,6 @@ class TextTable(NamedTuple):
             f"{argument}: {name!r} could be {listed}, columns of {str(self.path)!r}: rename one of them in the file, or pass "
             "the whole header if it differs from the other"
         )
-
-    def _expected(self, argument: str, si: str, header: object) -> str:
-        """What describes a column or its errors, for messages."""
-        unit = "deg" if si == "rad" else next(iter(UNITS[si]))
-        if header is not None:
-            return f"(header, unit), such as ({header!r}, {unit!r}), because the header has no unit that is known"
-        if argument == "error":
-            return f"(standard error, unit), such as (1.0, {unit!r}), or (header of a column of standard errors, unit)"
-        return f"(header, unit), such as ('tilt', {unit!r}), or a header with its unit, such as 'tilt [{unit}]'"
 
 
 def _text(path: Path) -> str:

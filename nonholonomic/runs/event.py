@@ -85,10 +85,6 @@ class EventFunction(eqx.Module):
         """The name of the function, for the request of a table."""
         return name_of(self.function)
 
-    def replaced(self, values: dict[str, Any]) -> "EventFunction":
-        """The event with other values of its numbers."""
-        return dataclasses.replace(self, parameters=self.parameters.replaced(values))
-
 
 def rows_of(model: AbstractModel, names: Names) -> jax.ShapeDtypeStruct:
     """The type of the rows of one state, as `AbstractModel.read` receives them."""

@@ -227,7 +227,9 @@ class AbstractSceneModel(AbstractModel):
 
     def replaced(self, values: dict[str, Any]) -> Self:
         own = {name: value for name, value in values.items() if not name.startswith("event.")}
-        event = self.event if self.event is None else self.event.replaced(values)
+        event = self.event
+        if event is not None:
+            event = dataclasses.replace(event, parameters=event.parameters.replaced(values))
         return dataclasses.replace(self, **with_numbers(self.roots, own), event=event)
 
 

@@ -93,7 +93,26 @@ def page(
     """
     parts = {"TITLE": html.escape(title), "HEIGHT": str(height), "ABOVE": above, "BELOW": below, "VIEW": ""}
     if stages:
-        parts["VIEW"] = "\n".join([_view(stages, speed, autoplay), *scripts])
+        if not can_view():
+            raise ModuleNotFoundError("a view needs three.js: pip install 'nonholonomic[view]'")
+        numbers = _Numbers()
+        facts = {
+            "speed": speed,
+            "speeds": [(f"{factor:g} x real time" if factor != 1.0 else "real time", factor) for factor in SPEEDS],
+            "autoplay": autoplay,
+            "stages": [_stage(stage, numbers) for stage in stages],
+        }
+        floats, whole = (np.concatenate(numbers.parts[kind]) for kind in ("<f4", "<i4"))
+        data = {
+            "library": files(PACKAGE).joinpath(*LIBRARY).read_bytes(),
+            "floats": floats.view(np.uint8).reshape(-1, 4).T.tobytes(),
+            "whole": whole.tobytes(),
+        }
+        view = [script(json.dumps(facts), ' type="application/json" id="facts"')]
+        for name, part in data.items():
+            coded = base64.b64encode(zlib.compress(part, 9)).decode()
+            view.append(script(coded, f' type="text/plain" id="{name}"'))
+        parts["VIEW"] = "\n".join([*view, *(script(template(name)) for name in SCRIPTS), *scripts])
     # In one pass: a title may contain the mark of another part.
     return Page(re.sub(r"\[([A-Z]+)\]", lambda mark: parts[mark[1]], template("page.html")))
 
@@ -123,28 +142,6 @@ def script(text: str, attributes: str = "") -> str:
 def template(name: str) -> str:
     """The text of a file of this folder, such as a part of a page."""
     return files("nonholonomic.views").joinpath(name).read_text(encoding="utf-8")
-
-
-def _view(stages: list[Stage], speed: float, autoplay: bool) -> str:
-    if not can_view():
-        raise ModuleNotFoundError("a view needs three.js: pip install 'nonholonomic[view]'")
-    numbers = _Numbers()
-    facts = {
-        "speed": speed,
-        "speeds": [(f"{factor:g} x real time" if factor != 1.0 else "real time", factor) for factor in SPEEDS],
-        "autoplay": autoplay,
-        "stages": [_stage(stage, numbers) for stage in stages],
-    }
-    floats, whole = (np.concatenate(numbers.parts[kind]) for kind in ("<f4", "<i4"))
-    data = {
-        "library": files(PACKAGE).joinpath(*LIBRARY).read_bytes(),
-        "floats": floats.view(np.uint8).reshape(-1, 4).T.tobytes(),
-        "whole": whole.tobytes(),
-    }
-    scripts = [script(json.dumps(facts), ' type="application/json" id="facts"')]
-    for name, part in data.items():
-        scripts.append(script(base64.b64encode(zlib.compress(part, 9)).decode(), f' type="text/plain" id="{name}"'))
-    return "\n".join([*scripts, *(script(template(name)) for name in SCRIPTS)])
 
 
 class _Numbers:
