@@ -102,7 +102,7 @@ def page(
             "autoplay": autoplay,
             "stages": [_stage(stage, numbers) for stage in stages],
         }
-        floats, whole = (np.concatenate(numbers.parts[kind]) for kind in ("<f4", "<i4"))
+        floats, whole = map(np.concatenate, numbers.parts.values())
         data = {
             "library": files(PACKAGE).joinpath(*LIBRARY).read_bytes(),
             "floats": floats.view(np.uint8).reshape(-1, 4).T.tobytes(),
@@ -145,31 +145,31 @@ def template(name: str) -> str:
 
 
 class _Numbers:
-    """Arrays of floats and whole numbers, stored one after the other; each array is identified by its start and its
-    length.
+    """Arrays of floats and whole numbers, stored one after the other; each array is identified by its kind, its start and
+    its length.
 
     Floats are stored byte plane by byte plane and whole numbers as differences, which compress better. Equal arrays are
     stored once.
     """
 
     def __init__(self):
-        self.parts: dict[str, list[np.ndarray]] = {"<f4": [], "<i4": []}
+        self.parts: dict[str, list[np.ndarray]] = {"floats": [], "whole": []}
         self.places: dict[tuple[str, bytes], tuple[int, int]] = {}
 
-    def add(self, values: np.ndarray, kind: str = "<f4") -> tuple[int, int]:
-        """Add an array of floats, or of whole numbers, "<i4"."""
-        flat = np.diff(values.ravel(), prepend=0) if kind == "<i4" else values.ravel()
-        flat = np.ascontiguousarray(flat, dtype=kind)
+    def add(self, values: np.ndarray, kind: str = "floats") -> dict[str, tuple[int, int]]:
+        """Add an array of floats, or of whole numbers, and return what identifies the array."""
+        flat = np.diff(values.ravel(), prepend=0) if kind == "whole" else values.ravel()
+        flat = np.ascontiguousarray(flat, dtype="<i4" if kind == "whole" else "<f4")
         key = kind, flat.tobytes()
         if key not in self.places:
             self.places[key] = (sum(map(len, self.parts[kind])), flat.size)
             self.parts[kind].append(flat)
-        return self.places[key]
+        return {kind: self.places[key]}
 
     def described(self, part: object) -> Any:
         """A part of a stage for the script: a named tuple by its fields, and arrays by their places."""
         if isinstance(part, Mesh):
-            vertices, triangles = self.add(part.vertices), self.add(part.triangles, "<i4")
+            vertices, triangles = self.add(part.vertices), self.add(part.triangles, "whole")
             return {"vertices": vertices, "triangles": triangles, "colour": css(part.colour)}
         if isinstance(part, Trace):
             part = part._replace(points=finite(part.points))

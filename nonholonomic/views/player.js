@@ -22,21 +22,13 @@ window.views = window.views || {};
     new Function("exports", "module", await (await inflated(text("library"))).text())(exports, {});
     return exports;
   }
-  function unpacked(stage, { floats, whole }) {
-    const mesh = (one) => ({ ...one, vertices: floats(one.vertices), triangles: whole(one.triangles) });
-    return {
-      ...stage,
-      arena: { ...mesh(stage.arena), lines: stage.arena.lines.map(floats) },
-      runs: stage.runs.map((run) => ({
-        ...run,
-        times: floats(run.times),
-        normal: floats(run.normal),
-        bodies: run.bodies.map((one) => ({ ...one, position: floats(one.position), orientation: floats(one.orientation), meshes: one.meshes.map(mesh) })),
-        traces: run.traces.map((one) => ({ ...one, points: floats(one.points), about: one.about && floats(one.about) })),
-        arrows: run.arrows.map((one) => ({ ...one, start: floats(one.start), vector: floats(one.vector) })),
-        curves: run.curves.map((one) => ({ ...one, values: floats(one.values) })),
-      })),
-    };
+  // A part of the facts with its arrays in place of what identifies them.
+  function unpacked(part, arrays) {
+    if (part === null || typeof part !== "object") return part;
+    if (Array.isArray(part)) return part.map((one) => unpacked(one, arrays));
+    if (part.floats) return arrays.floats(part.floats);
+    if (part.whole) return arrays.whole(part.whole);
+    return Object.fromEntries(Object.entries(part).map(([name, one]) => [name, unpacked(one, arrays)]));
   }
 
   const point = (values, [k, part]) =>

@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import ArrayLike
 
 from ...compilation.components import AbstractScalarReader, rows_along
 from ...compilation.xla_cpu import Equation, called_program, opened, programs_of, traced
@@ -154,7 +155,8 @@ class _Block(AbstractScalarReader):
                 blocks.append(lines)
         return [line for lines in reversed(blocks) for line in lines], names
 
-    constants = staticmethod(_value)
+    def constants(self, array: ArrayLike) -> Value:
+        return _value(array)
 
     def apply(self, equation: Equation, inputs: Values) -> Sequence[Value]:
         name, parameters = equation.primitive.name, equation.params

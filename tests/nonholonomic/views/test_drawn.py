@@ -247,13 +247,14 @@ def test_a_page_holds_its_numbers_in_single_precision():
     (show,) = stage.shows
     fact = facts["stages"][0]["runs"][0]
     assert fact == facts["stages"][1]["runs"][0]
-    for (start, length), values in (
+    for place, values in (
         (fact["times"], show.times),
         (fact["bodies"][0]["orientation"], show.bodies[0].orientation),
         (fact["arrows"][0]["vector"], show.arrows[0].vector),
     ):
+        start, length = place["floats"]
         np.testing.assert_allclose(floats[start : start + length], values.ravel(), rtol=1e-6, atol=1e-12)
-    start, length = facts["stages"][0]["arena"]["triangles"]
+    start, length = facts["stages"][0]["arena"]["triangles"]["whole"]
     triangles = np.cumsum(np.frombuffer(steps, "<i4")[start : start + length])
     np.testing.assert_array_equal(triangles, stage.arena.mesh.triangles.ravel())
     # The page of two balls, with three.js.
