@@ -19,7 +19,7 @@ from .likelihood import Free, Measurements, Unknown, as_free, as_gaussian
 
 # A model with its free parameters, and predictions with slopes, for many sets of parameters at once.
 
-#: Coordinates of one point, of a point for each row, and of n points; a number for each of n points; and a covariance.
+#: Coordinates of one point, of a point for each row, and of n points; a number for each point or measurement; and a covariance.
 Coordinates = Float[np.ndarray, " unknowns"]
 Rows = Float[np.ndarray, "rows unknowns"]
 Points = Float[np.ndarray, "n unknowns"]
