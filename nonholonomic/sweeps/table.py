@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Int
 
 from ..terminal import status_line
 from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html
@@ -264,7 +264,7 @@ class Table(eqx.Module):
                     f"variable = {shown(variable)}: the table has no {name!r}; it has {', '.join(self.variables)}"
                 )
         values, errors = self.variables[variable], self.variables[f"{variable}_error"]
-        return concise_strings(values, errors, self.variables.get("status", values))
+        return np.vectorize(concise, otypes="U")(values, errors, self.variables.get("status", values))
 
     def plot(
         self,
@@ -386,12 +386,18 @@ def cells_with(table: Table, name: str, word: str) -> Int[np.ndarray, " cells"]:
 # Numbers with their correct digits in concise notation: 5.01142(3) is 5.01142 with an error of 0.00003.
 
 
-def concise(value: float, error: float) -> str:
-    """A number with its correct digits and, in parentheses, the error of the last digit, rounded up.
+def concise(value: float, error: float, word: object = "") -> str:
+    """A number with its correct digits and, in parentheses, the error of the last digit, rounded up; a word without a number.
 
-    **Arguments:** `value`, `error`: finite numbers, the error at least 0; with an error of 0, the number is written in
-    full.
+    **Arguments:**
+
+    - `value`: the number; not finite if there is none.
+    - `error`: at least 0; with an error of 0, the number is written in full; infinite if it is doubtful whether there is a
+      number.
+    - `word`: the word for a missing number, which gets a question mark if it is doubtful that the number is missing.
     """
+    if np.isinf(error) or not np.isfinite(value):
+        return f"{word}?" if np.isinf(error) else str(word)
     if error == 0.0:
         return repr(float(value))
     place = math.floor(math.log10(error))
@@ -400,28 +406,6 @@ def concise(value: float, error: float) -> str:
     if digit == 10:
         place, digit = place + 1, 1
     return f"{round(value, -place):.0f}({digit * 10**place})" if place > 0 else f"{value:.{-place}f}({digit})"
-
-
-def concise_strings(
-    values: Float[np.ndarray, "..."], errors: Float[np.ndarray, "..."], words: Shaped[np.ndarray, "..."]
-) -> Shaped[np.ndarray, "..."]:
-    """Concise notation for every number of an array, or a word if there is no number.
-
-    **Arguments:**
-
-    - `values`: numbers; not finite if there is none.
-    - `errors`: errors of the values; infinite if it is doubtful whether there is a number.
-    - `words`: the words for missing numbers, with a question mark if it is doubtful that the number is missing.
-
-    **Returns:** an array of strings.
-    """
-
-    def string(value, error, word):
-        if np.isinf(error):
-            return f"{word}?"
-        return concise(value, error) if np.isfinite(value) else str(word)
-
-    return np.vectorize(string, otypes="U")(values, errors, words)
 
 
 # The quantities of a run over its times, as a table, and the methods that every run derives from this table.

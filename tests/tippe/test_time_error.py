@@ -18,7 +18,7 @@ from nonholonomic.runs.table import (
     errors_of,
     second_tolerance,
 )
-from nonholonomic.sweeps.table import concise, concise_strings
+from nonholonomic.sweeps.table import concise
 from tippe import steady
 from tippe.runs.model import INVERSIONS, TopModel
 
@@ -197,7 +197,7 @@ def test_agreement_on_no_answer_is_no_agreement(monkeypatch):
     for name in ("first_time", "last_time"):
         is_doubtful = np.isinf(outcome[f"{name}_error"])
         assert {word for word, doubt in zip(words, is_doubtful, strict=True) if doubt} == {"failed", "unresolved"}
-    assert concise_strings(outcome["last_time"], outcome["last_time_error"], np.array(words))[-1] == "unresolved?"
+    assert concise(outcome["last_time"][-1], outcome["last_time_error"][-1], words[-1]) == "unresolved?"
 
 
 def test_the_file_keeps_the_errors(tmp_path):
