@@ -667,13 +667,11 @@ def _times_of_launches(
             )
     is_limit = np.array([cell.startswith(">") for cell in cells])
     plain = ["inf" if cell in words else cell.removeprefix(">").strip() for cell in cells]
-    time = file._replace(cells={**file.cells, header: plain}).numbers(
-        "time",
-        header_and_unit,
-        "s",
-        remark=": if it stands for an event that did not happen, pass it as never",
-        infinite=True,
+    numeric, remark = (
+        file._replace(cells={**file.cells, header: plain}),
+        "if it stands for an event that did not happen",
     )
+    time = numeric.numbers("time", header_and_unit, "s", remark=f": {remark}, pass it as never", infinite=True)
     for line, cell, value in zip(file.lines, cells, time, strict=True):
         if value <= 0.0:
             raise ValueError(f"{header} = {cell!r} in line {line} of {str(file.path)!r} must be greater than 0")

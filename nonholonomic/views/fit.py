@@ -64,18 +64,9 @@ class _Drawn(NamedTuple):
         is_limit = np.array([row.censored for row in fit.residuals])
         # Draw an angle on the same turn as its prediction.
         turns = factors * np.asarray(fit.measurements.whole_periods((predicted - value) / factors))
-        times, curves = fit.curves
-        return cls(
-            series,
-            names,
-            np.where(is_limit, value, value + turns),
-            upper,
-            errors,
-            predicted,
-            is_limit,
-            times,
-            factors * curves if len(curves) else curves,
-        )
+        value, (times, curves) = np.where(is_limit, value, value + turns), fit.curves
+        curves = factors * curves if len(curves) else curves
+        return cls(series, names, value, upper, errors, predicted, is_limit, times, curves)
 
     def panels(self, chosen: list[int]) -> dict[str, list[int]]:
         """The series among `chosen` that share a panel, by the quantity, whatever the number of the data."""
