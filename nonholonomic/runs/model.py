@@ -39,7 +39,8 @@ class AbstractModel(eqx.Module):
     """A system, its start, its input and its event. A model knows its modes and quantities, and no solver, table, file or
     page.
 
-    The leaves are numbers: scalars, or arrays with one number per cell. States have the shape (components, cells).
+    The leaves are numbers: scalars, or arrays with one number per cell. States have the shape (components, cells). A subclass
+    defines the attributes that have no value here, for the class or as properties.
     """
 
     #: A `runs.event.EventFunction`, or `None` for the event of the model itself.
@@ -53,8 +54,6 @@ class AbstractModel(eqx.Module):
 
     #: The names that choose a layout in which states of nearby runs can be compared.
     comparable: ClassVar[Names] = ()
-
-    # Every model has the attributes that are declared below, as properties or for its class.
 
     # The parameters by name.
 
