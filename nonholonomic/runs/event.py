@@ -359,24 +359,21 @@ class Ensemble(eqx.Module):
         """The initial states."""
         return self.problem.start()[0] if self.problem is not None else jnp.asarray(self.states)
 
-    def has_event(self, outcome: Any) -> Bool[Array, " cells"]:
-        """The cells whose event counts: the run ended on it or, if runs continue, ends beyond it."""
-        if not self.continues:
-            return outcome.status == CROSSED
+
+def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Any, tolerance: Number) -> Any:
+    """How each run has ended, as an integer of `Status`: `EVENT` for the runs whose event counts, because the run ended on
+    the event or, if runs continue, ends beyond the event."""
+    status, has_event = model.ended(outcome, tolerance), outcome.status == CROSSED
+    if ensemble.continues:
         state = jnp.asarray(outcome.state)
-        if self.problem is not None:
-            value: Any = self.problem.event_function(state)
+        if ensemble.problem is not None:
+            value: Any = ensemble.problem.event_function(state)
         else:
             value = jnp.ones(state.shape[1])
-            for number, mode in enumerate(self.modes or ()):
+            for number, mode in enumerate(ensemble.modes or ()):
                 beyond: Any = mode.problem(state).event_function(state)
                 value = jnp.where(outcome.mode == number, beyond, value)
-        return (outcome.status == REACHED_END) & (value <= 0.0) & jnp.isfinite(outcome.crossing_time)
-
-
-def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Outcome | HybridOutcome, tolerance: Number) -> Any:
-    """How each run has ended, as an integer of `Status`: `EVENT` for the runs whose event counts."""
-    status, has_event = model.ended(outcome, tolerance), ensemble.has_event(outcome)
+        has_event = (outcome.status == REACHED_END) & (value <= 0.0) & jnp.isfinite(outcome.crossing_time)
     is_sound = (status == int(Status.EVENT)) | (status == int(Status.COMPLETED))
     return jnp.where(is_sound & has_event, int(Status.EVENT), status)
 
