@@ -220,7 +220,9 @@ def test_curves_are_drawn_and_what_is_constant_is_flat():
 def test_a_view_has_the_unit_that_was_asked_for(tmp_path, monkeypatch):
     run = Rolling()
     monkeypatch.setattr("nonholonomic.views.film.BROWSERS", (sys.executable,))
-    assert re.search(r'"label": "z \[cm\]", "values": \{"floats": \[\d+, \d+\]\}, "factor": 100\.0', run.view(unit="cm").html)
+    assert re.search(
+        r'"label": "z \[cm\]", "values": \{"floats": \[\d+, \d+\]\}, "factor": 100\.0', run.view(unit="cm").html
+    )
     with pytest.raises(ValueError, match=r"unit = 'deg' fits nothing that is drawn: x \[m\], z \[m\]"):
         run.view(unit="deg")
     with pytest.raises(ValueError, match="unit = 'grade' must be one of"):
