@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..text import SYNONYMS, UNITS, likely, one_line, readable_unit, shown
+from ..text import SYNONYMS, UNITS, counted, likely, one_line, readable_unit, shown
 from ..validation import as_number, as_number_or_none, as_path, require, warn
 from .likelihood import Measurements
 
@@ -527,13 +527,24 @@ def read_columns(
     names = quantities.of(tuple(name for name in columns if name not in ("time", "frame")))
     times = _times(file, columns, fps)
     value = np.stack([file.numbers(name, columns[name], known[name]) for name in names], axis=1)
-    mask = np.isfinite(times) & np.any(np.isfinite(value), axis=1)
+    is_sample = np.any(np.isfinite(value), axis=1)
+    mask = np.isfinite(times) & is_sample
     lines, seen = np.asarray(file.lines)[mask], times[mask]
     for k in np.flatnonzero(np.diff(seen) <= 0.0)[:1]:
         raise ValueError(
             f"time = {seen[k + 1]:.6g} s in line {lines[k + 1]} of {str(file.path)!r} must be later than "
             f"{seen[k]:.6g} s in line {lines[k]}{quantities.one_run}"
         )
+    if any(lost := is_sample & np.isnan(times)):
+        lines = counted(int(np.sum(lost)), "line")
+        warn(
+            f"path = {str(file.path)!r}: {lines} without a time left out, the first is line {file.lines[np.argmax(lost)]}"
+        )
+    for k, name in enumerate(names):
+        degree = file.parts(name, columns[name], known[name], "columns")[1]
+        largest = np.nanmax(np.abs(value[:, k]), initial=0.0) / degree
+        if known[name] == "rad" and degree < 1.0 and 0.2 < largest <= math.pi:
+            warn(f"{name} is at most {largest:.3g} deg in {str(file.path)!r}: is this column in rad?")
     errors = None
     if error is not None:
         if not isinstance(error, Mapping) or set(error) != set(names):

@@ -253,6 +253,17 @@ def test_angles_in_degrees_are_suspected():
         stroller.Recording(ride, times, [np.nan, 25.0], 0.01, "steering")
 
 
+def test_a_file_without_some_times_or_with_radians_called_degrees_is_asked_about(tmp_path):
+    launch = tippe.Launch(0.1, 100.0)
+    (tmp_path / "film.csv").write_text("time [s],theta [deg]\n0.1,5.7\n,6.1\n0.3,\n,\n0.5,6.3\n,6.4\n")
+    with pytest.warns(UserWarning, match="2 lines without a time left out, the first is line 3"):
+        film = tippe.read_recording(tmp_path / "film.csv", launch=launch)
+    np.testing.assert_allclose(film.times, [0.1, 0.5])
+    (tmp_path / "film.csv").write_text("time [s],theta [deg]\n0.1,0.1\n0.2,2.9\n")
+    with pytest.warns(UserWarning, match="theta is at most 2.9 deg in .*: is this column in rad?"):
+        tippe.read_recording(tmp_path / "film.csv", launch=launch)
+
+
 def test_times_in_milliseconds_are_suspected():
     with pytest.warns(UserWarning, match=r"samples are 33 s apart; times are in seconds: did you mean 1e-3 \* times"):
         tippe.Recording(tippe.Launch(0.1, 150.0), 33.0 * np.arange(1, 5), np.full(4, 0.3), 0.01)
