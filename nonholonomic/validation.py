@@ -457,7 +457,8 @@ class Bounded(eqx.Module, metaclass=Explaining):
             value = getattr(self, field.name)
             limits = field.metadata.get("range", {} if field.name in self.units else None)
             if value is not None and limits is not None:
-                yield from (Bound(part, name, **limits) for name, part in _parts(field.name, value).items())
+                for name, part in _parts(field.name, value).items():
+                    yield Bound(**({"value": part, "name": name} | limits))
 
     def suspicion(self) -> str | None:
         """A possible mistake in legal numbers, such as another unit, as text; `None` if there is none."""

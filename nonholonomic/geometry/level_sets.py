@@ -11,7 +11,7 @@ Optimization, chapter 4). A last Newton step carries the derivatives (implicit f
 """
 
 import abc
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -359,10 +359,7 @@ class Paraboloid(AbstractOpen, AbstractGradientSurface):
     units: ClassVar[dict[str, str]] = {"p": "m"}
     is_wavy: ClassVar[bool] = False
 
-    p: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.p, "p", above=0.0)
+    p: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         return (x * x + y * y) / (2.0 * self.p)

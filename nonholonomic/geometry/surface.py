@@ -54,6 +54,9 @@ CLOSED: Mapping[str, float] = {"outside": 1.0, "inside": -1.0}
 OPEN: Mapping[str, float] = {"above": 1.0}
 DIVIDED: Mapping[str, float] = {"positive": 1.0}
 
+#: The range of a radius, by a name that tells it from that of a body.
+RADIUS = {"range": {"above": 0.0, "name": "surface radius"}}
+
 
 #: The methods of a user's surface that are mapped over lanes.
 MAPPED = ("normal", "normal_rate", "bending", "elevation", "gaussian_curvature", "nearest", "onto", "ball_gap")
@@ -291,11 +294,11 @@ class Plane(AbstractSurface):
     sides: ClassVar[Mapping[str, float]] = {"outside": CLOSED["outside"], **OPEN}
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"))
 
-    tilt: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
-
-    def bounds(self) -> Iterator[Bound]:
-        if self.tilt is not None:
-            yield Bound(self.tilt, "tilt", at_least=-math.pi / 2.0, at_most=math.pi / 2.0, unit="rad")
+    tilt: Float[Array, "..."] | None = eqx.field(
+        converter=none_if_zero,
+        default=None,
+        metadata={"range": {"at_least": -math.pi / 2.0, "at_most": math.pi / 2.0, "unit": "rad"}},
+    )
 
     @property
     def up(self) -> Vector:
@@ -365,10 +368,7 @@ class Cylinder(AbstractGradientSurface):
 
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("y", "m"), ("eta", "rad"))
 
-    radius: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.radius, "surface radius", above=0.0)
+    radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=RADIUS)
 
     def gradient(self, position: Vector) -> Vector:
         return (position[0], None, position[2])
@@ -487,10 +487,7 @@ class Sphere(AbstractQuadric):
 
     units: ClassVar[dict[str, str]] = {"radius": "m"}
 
-    radius: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.radius, "surface radius", above=0.0)
+    radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=RADIUS)
 
     @property
     def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -523,12 +520,8 @@ class Spheroid(AbstractQuadric):
 
     units: ClassVar[dict[str, str]] = {"equatorial": "m", "polar": "m"}
 
-    equatorial: Float[Array, "..."] = eqx.field(converter=as_number)
-    polar: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.equatorial, "equatorial", above=0.0)
-        yield Bound(self.polar, "polar", above=0.0)
+    equatorial: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    polar: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     @classmethod
     def from_oblate(cls, a: ArrayLike, xi: ArrayLike) -> "Spheroid":
@@ -616,12 +609,11 @@ class Torus(AbstractGradientSurface):
     units: ClassVar[dict[str, str]] = {"ring": "m", "tube": "m"}
     is_wavy: ClassVar[bool] = False
 
-    ring: Float[Array, "..."] = eqx.field(converter=as_number)
-    tube: Float[Array, "..."] = eqx.field(converter=as_number)
+    ring: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    tube: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.ring, "ring", above=0.0)
-        yield Bound(self.tube, "tube", above=0.0)
+        yield from super().bounds()
         yield Bound(
             self.tube, "tube", below=self.ring, why="the radius of the ring: otherwise the tube would intersect itself"
         )
