@@ -186,6 +186,25 @@ class Sideways(tippe.AbstractFriction):
         return ContactLoad(force, (None, None, self.torque * jnp.tanh(slip.turning[2])))
 
 
+class Pushing(tippe.Coulomb):
+    """Coulomb's law with the wrong sign."""
+
+    def per_normal_force(self, slip):
+        x, y = super().per_normal_force(slip).force
+        return ContactLoad(force=(-x, -y))
+
+
+class Drag(tippe.AbstractFriction):
+    """A law of a user's with one number, without a range of its own."""
+
+    units = {"drag": "s m-1"}  # noqa: RUF012
+
+    drag: object = eqx.field(converter=jnp.asarray)
+
+    def per_normal_force(self, slip):
+        return ContactLoad(force=(-self.drag * slip.x, -self.drag * slip.y))
+
+
 class Pair(tippe.AbstractFriction):
     """A law that returns no load."""
 
@@ -212,6 +231,12 @@ def test_a_law_that_cannot_be_evaluated_is_refused_when_it_is_constructed(law, m
         law()
 
 
+def test_a_number_with_a_unit_must_be_finite():
+    assert str(Drag(0.3)) == "Drag(drag=0.3 s/m)"
+    with pytest.raises(ValueError, match=r"drag = nan must be finite"):
+        Drag(np.nan)
+
+
 def test_a_law_that_drives_the_top_is_told_when_it_is_constructed():
     """By its worst slip: in a belt's direction, for a slow slip, 0.3 (v_belt - v) v."""
     slip = (
@@ -219,6 +244,8 @@ def test_a_law_that_drives_the_top_is_told_when_it_is_constructed():
     )
     with pytest.warns(UserWarning, match=slip):
         Belt()
+    with pytest.warns(UserWarning, match=r"friction = Pushing\(mu=0.3, slip_speed=0.05 m/s\) drives the top"):
+        Pushing(0.3, 0.05)
     with pytest.warns(UserWarning, match=r"and a turning of -?100 rad/s its power is .* Is a sign wrong\?"):
         Sideways(1e-2)
     with warnings.catch_warnings():
