@@ -57,8 +57,8 @@ from .model.scene import Launch, Scene
 
 # Checks of the arguments of steady motions; traced numbers pass.
 
-#: Advice in messages about lists.
-MANY = "jax.vmap maps over several"
+#: Advice in messages about lists, and about what is no motion.
+MANY, A_MOTION = "jax.vmap maps over several", ", as tumbling(scene, theta) returns it"
 
 
 def _require_top(body: object) -> None:
@@ -220,7 +220,8 @@ def tumbling_state(scene: Scene[Top], motion: Tumbling) -> Float[Array, " 8"]:
     >>> print(f"{1e3 * scene.energy(steady.tumbling_state(scene, motion)):.3f} mJ")
     4.886 mJ
     """
-    _require_motion(scene, motion)
+    _require_scene_of_a_top(scene)
+    require_kind(motion, "motion", Tumbling, A_MOTION)
     body, s, c = scene.body, jnp.sin(motion.theta), jnp.cos(motion.theta)
     zero = jnp.zeros_like(s)
     transverse, axial = -body.I1 * motion.precession * s, body.I3 * motion.spin
@@ -246,12 +247,6 @@ def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
     (u1, u2), (e1, e2, _), (L1, L2, _), _ = parts(state)
     zero = jnp.zeros_like(u1)
     return joined((-u2, u1), (-e2, e1, zero), (-L2, L1, zero))
-
-
-def _require_motion(scene: Scene[Top], motion: Tumbling) -> None:
-    """Raise `ValueError` unless this is a scene on the plane and a motion from `tumbling`."""
-    _require_scene_of_a_top(scene)
-    require_kind(motion, "motion", Tumbling, ", as tumbling(scene, theta) returns it")
 
 
 def _lever_and_inertia(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> tuple[Array, Array]:
@@ -459,7 +454,8 @@ def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
     >>> print(f"{steady.growth_rate(steady.tumbling_matrix(scene, motion)):.2f} 1/s")
     -0.35 1/s
     """
-    _require_motion(scene, motion)
+    _require_scene_of_a_top(scene)
+    require_kind(motion, "motion", Tumbling, A_MOTION)
     _require_one_scene(scene, **{f"motion.{name}": value for name, value in motion._asdict().items()})
     return _tumbling_matrix(scene, motion)
 

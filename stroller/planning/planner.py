@@ -308,26 +308,21 @@ def drawn_task(
     scene: Scene, problems: Callable[[np.random.Generator], dict[str, Any]], random: np.random.Generator, number: int
 ) -> tuple[Task, float]:
     """A random problem as the optimiser needs it, and its duration [s]; `number` names the draw in messages."""
-    parts = problems(random)
+    parts: object = problems(random)
     try:
-        _require_arguments(parts)
+        if not isinstance(parts, dict):
+            needed, optional = ", ".join(NEEDED), ", ".join(name for name in TASK_PARTS if name not in NEEDED)
+            raise ValueError(f"{shown(parts)} must be a dict with {needed}, and if needed {optional}")
+        for name in parts:
+            if name not in TASK_PARTS:
+                raise ValueError(f"{name!r} must be one of {', '.join(TASK_PARTS)}{likely(name, TASK_PARTS)}")
+        for name in NEEDED:
+            if name not in parts:
+                raise ValueError(f"{name!r} is missing: a problem needs {', '.join(NEEDED)}")
         problem = checked_problem(scene, **parts)
     except ValueError as error:
         raise ValueError(f"problems: draw {number}: {error}") from None
     return Task.of(problem, problem.distance, problem.t1, problem.clearance), problem.t1
-
-
-def _require_arguments(parts: object) -> None:
-    """Raise `ValueError` unless these are arguments of `plan` of which a problem consists."""
-    if not isinstance(parts, dict):
-        needed, optional = ", ".join(NEEDED), ", ".join(name for name in TASK_PARTS if name not in NEEDED)
-        raise ValueError(f"{shown(parts)} must be a dict with {needed}, and if needed {optional}")
-    for name in parts:
-        if name not in TASK_PARTS:
-            raise ValueError(f"{name!r} must be one of {', '.join(TASK_PARTS)}{likely(name, TASK_PARTS)}")
-    for name in NEEDED:
-        if name not in parts:
-            raise ValueError(f"{name!r} is missing: a problem needs {', '.join(NEEDED)}")
 
 
 def stacked(tasks: list[tuple[Task, float]]) -> tuple[Task, Float[np.ndarray, " tasks"]]:

@@ -237,7 +237,13 @@ def launches(
             raise ValueError(f"axes: {number!r} has its own argument")
     values |= axes
     scalars = {number: value for number, value in values.items() if np.ndim(value) == 0}
-    launch = _with_room(scene, values)
+    # A launch with entries for all given numbers.
+    sizes = {name: len(parts) for name, parts in SEVERAL.items()}
+    sizes["place"] = 3 if "launch.place[2]" in values else len(scene.surface.coordinates)
+    vectors = {
+        name: (0.0,) * size for name, size in sizes.items() if any(f"launch.{name}[{k}]" in values for k in range(size))
+    }
+    launch = Launch(theta=0.0, spin=0.0, **vectors)
     names = labels(scene, launch, values, taken)
     listed = [(number, *names[number]) for number in values if number not in scalars]
     grid = [axis(name, number, unit, values[number], long_name) for number, name, unit, long_name in listed]
@@ -245,13 +251,3 @@ def launches(
     # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
     require_run(roots["scene"], roots["launch"], t1, tolerance, (Scene, Launch), LISTS)
     return roots, grid
-
-
-def _with_room(scene: Scene, values: Collection[str]) -> Launch:
-    """A launch with entries for all given numbers."""
-    sizes = {name: len(parts) for name, parts in SEVERAL.items()}
-    sizes["place"] = 3 if "launch.place[2]" in values else len(scene.surface.coordinates)
-    parts = {
-        name: (0.0,) * size for name, size in sizes.items() if any(f"launch.{name}[{k}]" in values for k in range(size))
-    }
-    return Launch(theta=0.0, spin=0.0, **parts)
