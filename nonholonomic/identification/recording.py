@@ -536,9 +536,9 @@ def read_columns(
             f"{seen[k]:.6g} s in line {lines[k]}{quantities.one_run}"
         )
     if any(lost := is_sample & np.isnan(times)):
-        lines = counted(int(np.sum(lost)), "line")
+        left_out = counted(int(np.sum(lost)), "line")
         warn(
-            f"path = {str(file.path)!r}: {lines} without a time left out, the first is line {file.lines[np.argmax(lost)]}"
+            f"path = {str(file.path)!r}: {left_out} without a time left out, the first is line {file.lines[np.argmax(lost)]}"
         )
     for k, name in enumerate(names):
         degree = file.parts(name, columns[name], known[name], "columns")[1]
