@@ -73,11 +73,6 @@ class Problem(eqx.Module):
         stack: Any = np.stack if isinstance(coordinates, np.ndarray) else jnp.stack
         return stack([unknown.value(coordinates[..., k]) for k, unknown in enumerate(self.unknowns)], axis=-1)
 
-    def slopes(self, coordinates: Coordinates) -> Coordinates:
-        """The slopes of the parameters with respect to their coordinates."""
-        pairs = zip(coordinates, self.unknowns, strict=True)
-        return np.array([float(jax.grad(unknown.value)(coordinate)) for coordinate, unknown in pairs])
-
     @property
     def on_host(self) -> bool:
         """Whether the model cannot be traced."""

@@ -283,7 +283,10 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         "failed" if np.isinf(deviance) else "converged" if has_converged else "not_converged"
         for deviance, has_converged in zip(deviances, ends.converged, strict=True)
     )
-    by_slopes, slopes = ends.covariance(best), problem.slopes(optimum)
+    # The slopes of the parameters with respect to their coordinates.
+    pairs = zip(problem.unknowns, optimum, strict=True)
+    slopes = np.array([float(jax.grad(unknown.value)(coordinate)) for unknown, coordinate in pairs])
+    by_slopes = ends.covariance(best)
     distribution = Distribution.of(optimum, by_slopes, sample)
     likely, covariance = problem.values(optimum), distribution.covariance_of_values(problem, slopes)
     numbers = (measurements.value, measurements.error, linearised.prediction[best], linearised.residual[best, :count])

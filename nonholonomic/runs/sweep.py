@@ -293,7 +293,10 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
     listed: dict[str, Any] | None = None
     if options.scattered:
         listed = scattered_cells(grid)
-        request |= {"cells": digest(listed)}
+        checksum = hashlib.sha256()
+        for name, values in listed.items():
+            checksum.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
+        request |= {"cells": checksum.hexdigest()[:16]}
         variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
         work = ScatteredJob(job, listed, {axis.number: axis.name for axis in grid})
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
@@ -333,11 +336,3 @@ def _warn_of_illegal_cells(model: AbstractModel, first: dict[str, float], count:
         named = ", ".join(f"{name} = {value:.6g}" for name, value in first.items())
         reason = f"; {'the first is at ' * bool(named)}{named}: {error}"
     warn(f"{count} of {cells} cells are illegal: their results are NaN, and their status is 'illegal'{reason}")
-
-
-def digest(columns: dict[str, Any]) -> str:
-    """A checksum of the columns and their names."""
-    checksum = hashlib.sha256()
-    for name, values in columns.items():
-        checksum.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
-    return checksum.hexdigest()[:16]
