@@ -94,7 +94,11 @@ def as_quantity(words: object) -> Any:
 
 
 class AbstractData(eqx.Module):
-    """A set of data of a fit."""
+    """A set of data of a fit.
+
+    In a fit of runs, it has a method `model(system)` that returns the checked model of the runs; the numbers of its start have
+    a value per run if there are several.
+    """
 
     #: Number of predictions, and the indices of those that were measured, ordered by time.
     size: ClassVar[int]

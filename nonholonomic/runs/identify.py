@@ -1,6 +1,5 @@
 """Fits of any model: their data, and the predictions that are compared with the data."""
 
-import abc
 import dataclasses
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
@@ -167,10 +166,6 @@ class AbstractEventTimes(AbstractData):
         is_before = (first == 0.0) & np.isfinite(last)
         student = math.inf if self.student is None else float(self.student)
         return Measurements(np.where(is_before, -np.inf, first), self.error, upper=last, student=student)
-
-    @abc.abstractmethod
-    def model(self, system: object) -> AbstractModel:
-        """The model of the timed run, checked. The numbers of its start have a value per run if there are several."""
 
     def predicted(self, model: AbstractModel, t1: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
         """The predicted time of one run."""
