@@ -18,7 +18,7 @@ from tops import rutstam_top
 
 import stroller
 import tippe
-from nonholonomic.integration import Settings
+from nonholonomic.runs.model import settings_for_lanes
 from tippe.runs.verbs import warn_of_long_runs
 
 pytestmark = pytest.mark.oldest
@@ -188,7 +188,7 @@ def programs_of_its_own():
 @pytest.mark.usefixtures("programs_of_its_own")
 def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeypatch):
     module = importlib.import_module("tippe.runs.verbs")
-    monkeypatch.setattr(module, "Settings", functools.partial(Settings, max_steps=40))
+    monkeypatch.setattr(module, "settings_for_lanes", functools.partial(settings_for_lanes, max_steps=40))
     message = (
         r"t1 = 100000 s is too long: the run needs more than 40 steps, which reached only 0\.\d+ s; take a shorter t1"
     )
