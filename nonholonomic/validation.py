@@ -456,7 +456,8 @@ class Bounded(eqx.Module, metaclass=Explaining):
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             limits = field.metadata.get("range", {} if field.name in self.units else None)
-            if value is not None and limits is not None:
+            is_omitted = value is None and field.default is None
+            if limits is not None and not is_omitted:
                 for name, part in _parts(field.name, value).items():
                     yield Bound(**({"value": part, "name": name} | limits))
 
