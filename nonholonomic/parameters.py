@@ -37,8 +37,7 @@ def numbers(root: str, tree: PyTree, functions: bool = True) -> dict[str, Any]:
     **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for an optional number
     that was omitted.
     """
-    # The user's module itself, for a module that is evaluated over lanes.
-    values, tree = {}, tree.function if isinstance(tree, AbstractHeld) else tree
+    values, tree = {}, _itself(tree)
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
         if isinstance(value, Numbers):
@@ -55,6 +54,11 @@ def numbers(root: str, tree: PyTree, functions: bool = True) -> dict[str, Any]:
 def numbers_of(roots: dict[str, PyTree]) -> dict[str, Any]:
     """Every parameter of several trees. **Arguments:** `roots`: name -> tree."""
     return {name: value for root, tree in roots.items() for name, value in numbers(root, tree).items()}
+
+
+def _itself(tree: PyTree) -> PyTree:
+    """The user's module itself for a module that is evaluated over lanes."""
+    return tree.function if isinstance(tree, AbstractHeld) else tree
 
 
 def _entries(name: str, shape: tuple[int, ...]) -> list[str]:
@@ -216,7 +220,7 @@ def description(root: str, tree: PyTree) -> dict[str, Any]:
 
     A function is described by its name alone. Nothing in the data is different in another process.
     """
-    tree = tree.function if isinstance(tree, AbstractHeld) else tree
+    tree = _itself(tree)
     fields: dict[str, Any] = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)

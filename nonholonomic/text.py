@@ -215,8 +215,7 @@ def require_unit_of(unit: Unit, units: Mapping[str, str]) -> None:
 def require_unit(unit: object) -> None:
     """Raise `ValueError` unless this is `None`, a unit that pictures can show, or a list of such units."""
     known = [name for readable, names in UNITS.items() if readable != "1" for name in names]
-    names = [unit] if isinstance(unit, str) else unit
-    legal = [*known, *SYNONYMS]
+    names, legal = [unit] if isinstance(unit, str) else unit, [*known, *SYNONYMS]
     if unit is not None and not (isinstance(names, list | tuple) and all(name in legal for name in names)):
         listed, hint = ", ".join(known), likely(unit, known)
         raise ValueError(f"unit = {shown(unit)} must be one of {listed}, or a list of them{hint}")
@@ -329,11 +328,11 @@ def distinguishing_labels(
     for group in groups:
         parts = [part + difference for part, difference in zip(parts, differences(group, unit), strict=True)]
     names = [", ".join(part or start) for part, start in zip(parts, starts, strict=True)]
-    if longest is not None:
-        # Cut after the last part that is whole, if any is.
-        ends = [name.rfind(", ", 0, longest + 2) if len(name) > longest else len(name) for name in names]
-        ends = [longest if end < 0 else end for end in ends]
-        names = [name[:end] + ", …" * (end < len(name)) for name, end in zip(names, ends, strict=True)]
+    for k, name in enumerate(names):
+        if longest is not None and len(name) > longest:
+            # Cut after the last part that is whole, if any is.
+            end = name.rfind(", ", 0, longest + 2)
+            names[k] = f"{name[: longest if end < 0 else end]}, …"
     count = names.count
     return [name if count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)]
 

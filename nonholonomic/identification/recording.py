@@ -544,11 +544,11 @@ def read_columns(
         warn(
             f"path = {str(file.path)!r}: {left_out} without a time left out, the first is line {file.lines[np.argmax(lost)]}"
         )
-    for k, name in enumerate(names):
-        degree = file.parts(name, columns[name], known[name], "columns")[1]
-        largest = np.nanmax(np.abs(value[:, k]), initial=0.0) / degree
-        if known[name] == "rad" and degree < 1.0 and 0.2 < largest <= math.pi:
-            warn(f"{name} is at most {largest:.3g} deg in {str(file.path)!r}: is this column in rad?")
+    for k in (k for k, name in enumerate(names) if known[name] == "rad"):
+        _, size = file.parts(names[k], columns[names[k]], "rad", "columns")
+        largest = np.nanmax(np.abs(value[:, k]), initial=0.0) / size
+        if size < 1.0 and 0.2 < largest <= math.pi:
+            warn(f"{names[k]} is at most {largest:.3g} deg in {str(file.path)!r}: is this column in rad?")
     errors = None
     if error is not None:
         if not isinstance(error, Mapping) or set(error) != set(names):

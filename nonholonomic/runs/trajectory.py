@@ -358,8 +358,8 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
         # A batch, or a run inside a transformation, has no single values to show.
         if is_traced((self.t, self.codes)) or np.ndim(self.t) != 1:
             *batch, times = np.shape(self.t)
-            one = f"Trajectory of {times} times, inside a transformation"
-            runs = f"{math.prod(batch)} runs of {times} times" if batch else one
+            traced_run = f"Trajectory of {times} times, inside a transformation"
+            runs = f"{math.prod(batch)} runs of {times} times" if batch else traced_run
             codes = [] if self.codes is None or is_traced(self.codes) else np.ravel(self.codes)
             counts = Counter(Status(int(code)).word for code in codes)
             return ": ".join(filter(None, [runs, ", ".join(f"{count} {word}" for word, count in counts.items())]))

@@ -446,8 +446,8 @@ class Top(AbstractBody):
             unit = "mm" if np.max(radius) > 10.0 else "cm"
             return f"radius = {np.max(radius):g} m is large for a top: was it in {unit}?"
         is_dense = np.any(density >= GREATEST_DENSITY)
-        odd = f"mass = {np.max(density):.3g} kg/m^3 of volume" if is_dense else f"I1 = {np.max(ratio):.3g} m R^2"
-        question = f"{odd} is unusual for a top: are mass, radius and I1 in kg, m and kg m^2?"
+        suspect = f"mass = {np.max(density):.3g} kg/m^3 of volume" if is_dense else f"I1 = {np.max(ratio):.3g} m R^2"
+        question = f"{suspect} is unusual for a top: are mass, radius and I1 in kg, m and kg m^2?"
         return None if is_legal else question
 
 
