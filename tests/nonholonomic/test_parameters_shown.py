@@ -63,6 +63,7 @@ def test_html_escapes_and_lines_are_aligned():
     assert "a &lt; b" in as_html("a < b", [("x", "<1>")])
     assert "&lt;1&gt;" in as_html("a", [("x", "<1>")])
     assert text_as_html("title\nx < 1").count("<pre>x &lt; 1</pre>") == 1
+    assert "\n  gravity   9.81 m/s²\n  contact   'hybrid'" in str(tippe.presets.classroom_scene())
 
 
 def test_runs_are_told_apart_by_what_differs():
