@@ -127,9 +127,8 @@ def environment_name() -> str:
 
 def processor() -> str:
     """The kind and features of the processor, as far as the system reports them."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
+    lines = _reported("/proc/cpuinfo").decode().splitlines()
+    if not lines:
         return platform.processor()
     # Assume that all cores are alike. ARM calls the features by another name.
     kinds = ("vendor_id", "cpu family", "model", "flags", "CPU implementer", "CPU part", "Features")
@@ -230,20 +229,15 @@ def _place(folder: Path, facts: object) -> Path:
     """The archive of some files."""
     settings: Any = jax.config
     machine = (environment_name(), jax.default_backend(), str(jax.numpy.result_type(float)))
-    state = (facts, _versions(), machine, sorted(settings.values.items()))
+    versions = [platform.python_version()]
+    for package in PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            versions.append(f"{package} {version(package)}")
+    state = (facts, versions, machine, sorted(settings.values.items()))
     digest = hashlib.sha256(repr(state).encode())
     for path in sorted(_sources()):
         digest.update(path.read_bytes())
     return folder / f"files-{digest.hexdigest()[:32]}"
-
-
-def _versions() -> list[str]:
-    """The version of Python, and those of `PACKAGES`; none for a package that is not installed."""
-    installed = [platform.python_version()]
-    for package in PACKAGES:
-        with contextlib.suppress(PackageNotFoundError):
-            installed.append(f"{package} {version(package)}")
-    return installed
 
 
 def _sources() -> Iterator[Path]:
@@ -330,10 +324,8 @@ def forget_programs_if_many(most_memory: float | None = None) -> bool:
 
 def resident_memory() -> int:
     """Resident memory of this process [bytes]; 0 if the system does not report it."""
-    try:
-        return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
-        return 0
+    pages = _reported("/proc/self/statm").split()
+    return int(pages[1]) * os.sysconf("SC_PAGE_SIZE") if pages else 0
 
 
 @functools.cache
@@ -344,25 +336,27 @@ def memory_of_machine() -> float:
         limits.append(float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES"))
     # Of version 2 and of version 1 of Linux' control groups; "max" is no limit.
     for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        with contextlib.suppress(OSError, ValueError):
-            limits.append(float(Path(path).read_text()))
+        with contextlib.suppress(ValueError):
+            limits.append(float(_reported(path)))
     return min(limits, default=0.0)
 
 
 def count_mappings() -> int:
     """Number of memory mappings of this process; 0 if the system does not report it."""
-    try:
-        return Path("/proc/self/maps").read_bytes().count(b"\n")
-    except OSError:
-        return 0
+    return _reported("/proc/self/maps").count(b"\n")
 
 
 def most_mappings() -> int:
     """Number of memory mappings that a process may have."""
+    return int(_reported("/proc/sys/vm/max_map_count") or 65_530)
+
+
+def _reported(path: str) -> bytes:
+    """What the system reports in a file; nothing if it has no such file."""
     try:
-        return int(Path("/proc/sys/vm/max_map_count").read_bytes())
+        return Path(path).read_bytes()
     except OSError:
-        return 65_530
+        return b""
 
 
 def release_memory() -> None:

@@ -1,6 +1,7 @@
 """Read traced functions: on which arguments they depend, of which operations they consist, when they jump, and their bounds."""
 
 import contextlib
+import copy
 import functools
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -19,9 +20,8 @@ from .xla_cpu import (
     Program,
     bound,
     called_program,
-    opened,
+    equations_in,
     operations,
-    programs_in,
     programs_of,
     read_program,
     traced,
@@ -140,11 +140,7 @@ class TracedFunction:
 
     def __reduce__(self) -> tuple[Function, tuple[Function]]:
         # A program cannot be pickled, but the function may be.
-        return _itself, (self.function,)
-
-
-def _itself(function: Function) -> Function:
-    return function
+        return copy.copy, (self.function,)
 
 
 def _comparable(value: object) -> Hashable:
@@ -390,8 +386,7 @@ def _depends(kind: Kind) -> bool:
 
 def _compares(program: Program) -> bool:
     """Whether a program compares real numbers."""
-    equations: list[Equation] = [equation for inner in programs_in(program) for equation in opened(inner)[0].eqns]
-    comparisons = (equation for equation in equations if equation.primitive.name in COMPARISONS)
+    comparisons = (equation for equation in equations_in(program) if equation.primitive.name in COMPARISONS)
     return any(jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact) for equation in comparisons)
 
 
@@ -480,7 +475,7 @@ def _applied(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose:
             raise
         return [_anything(variable.aval) for variable in equation.outvars]
     if name == "atan2":
-        leaps.append(_contains(boxes[0]) & (boxes[1].low <= 0.0))
+        leaps.append(_contains_zero(boxes[0]) & (boxes[1].low <= 0.0))
     elif name == "rem":
         turns = _quotient(*boxes)
         leaps.append(jnp.trunc(turns.low) != jnp.trunc(turns.high))
@@ -536,8 +531,8 @@ def _product(a: Bounds, b: Bounds) -> Bounds:
     return _hull(a.low * b.low, a.low * b.high, a.high * b.low, a.high * b.high)
 
 
-def _contains(box: Bounds, number: float = 0.0) -> Array:
-    return (box.low <= number) & (box.high >= number)
+def _contains_zero(box: Bounds) -> Array:
+    return (box.low <= 0.0) & (box.high >= 0.0)
 
 
 def _everything_where(unknown: Array, box: Bounds) -> Bounds:
@@ -545,14 +540,14 @@ def _everything_where(unknown: Array, box: Bounds) -> Bounds:
 
 
 def _quotient(a: Bounds, b: Bounds) -> Bounds:
-    zero = _contains(b)
+    zero = _contains_zero(b)
     low, high = jnp.where(zero, 1.0, b.low), jnp.where(zero, 1.0, b.high)
     return _everything_where(zero, _product(a, Bounds(1.0 / high, 1.0 / low)))
 
 
 def _even(box: Bounds, function: Callable[[Array], Array]) -> Bounds:
     """Bounds of a function that is even and grows with the distance from zero."""
-    nearest = jnp.where(_contains(box), 0.0, jnp.minimum(jnp.abs(box.low), jnp.abs(box.high)))
+    nearest = jnp.where(_contains_zero(box), 0.0, jnp.minimum(jnp.abs(box.low), jnp.abs(box.high)))
     return Bounds(function(nearest), function(jnp.maximum(jnp.abs(box.low), jnp.abs(box.high))))
 
 
@@ -588,7 +583,7 @@ def _tangent(box: Bounds) -> Bounds:
 def _angle(y: Bounds, x: Bounds) -> Bounds:
     """Bounds of atan2, which jumps where y passes zero and x is negative."""
     ends = _hull(*(jnp.arctan2(a, b) for a in y for b in x))
-    jumps = _contains(y) & (x.low <= 0.0)
+    jumps = _contains_zero(y) & (x.low <= 0.0)
     return Bounds(jnp.where(jumps, -jnp.pi, ends.low), jnp.where(jumps, jnp.pi, ends.high))
 
 

@@ -48,6 +48,11 @@ def traced(function: Function, *arguments: PyTree) -> tuple[ClosedJaxpr, PyTree]
     return program, shape
 
 
+def traced_once(function: Function, *examples: PyTree) -> Function:
+    """The same function, which JAX traces once, for arguments like the examples, however often it is called."""
+    return eqx.filter_closure_convert(lambda *arguments: function(*arguments), *examples)
+
+
 def opened(program: Program) -> tuple[Jaxpr, Sequence[ArrayLike]]:
     """A program without its constants, and the constants."""
     return (program.jaxpr, program.consts) if isinstance(program, ClosedJaxpr) else (program, ())
@@ -112,16 +117,18 @@ def programs_in(program: Program, visited: set[int] | None = None) -> Iterator[P
 
 def programs_of(equation: Equation) -> list[Program]:
     """The programs among the parameters of an equation."""
+    values = jax.tree.leaves(list(equation.params.values()), is_leaf=lambda value: isinstance(value, Program))
+    return [value for value in values if isinstance(value, Program)]
 
-    def is_program(value: object) -> bool:
-        return isinstance(value, Program)
 
-    return list(filter(is_program, jax.tree.leaves(list(equation.params.values()), is_leaf=is_program)))
+def equations_in(program: Program) -> list[Equation]:
+    """The equations of a program and of the programs inside it."""
+    return [equation for inner in programs_in(program) for equation in opened(inner)[0].eqns]
 
 
 def operations(program: Program) -> set[str]:
     """The names of the operations of a program and of the programs inside it."""
-    return {equation.primitive.name for inner in programs_in(program) for equation in opened(inner)[0].eqns}
+    return {equation.primitive.name for equation in equations_in(program)}
 
 
 Result = TypeVar("Result")
@@ -254,11 +261,8 @@ def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     >>> jax.grad(lambda x: least(2.0 * x, 1.0))(0.3).item()
     2.0
     """
-
-    def lesser(a: Any, b: Any) -> Any:
-        return jnp.where((a < b) | jnp.isnan(a), a, b)
-
-    return functools.reduce(lesser, numbers)
+    result: Any = functools.reduce(lambda a, b: jnp.where(jnp.less(a, b) | jnp.isnan(a), a, b), numbers)
+    return result
 
 
 def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
@@ -270,11 +274,8 @@ def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     >>> jax.grad(lambda x: greatest(2.0 * x, 0.0))(0.3).item()
     2.0
     """
-
-    def greater(a: Any, b: Any) -> Any:
-        return jnp.where((a > b) | jnp.isnan(a), a, b)
-
-    return functools.reduce(greater, numbers)
+    result: Any = functools.reduce(lambda a, b: jnp.where(jnp.greater(a, b) | jnp.isnan(a), a, b), numbers)
+    return result
 
 
 def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ...]:

@@ -25,7 +25,7 @@ from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, 
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, time_at_jump
 from ..integration.runge_kutta import Stages, moved_state, over_stages
 from ..integration.scheduler import InLanes, LaneScheduler, Recorder, SchedulerState, outcome_of, with_crossing_times
-from ..integration.step import length_to_try, try_step, until_jump
+from ..integration.step import length_to_try, try_step
 from .variation import RunOptions, Tangent, Tangents, VariationalProblem, in_groups, moving_leaves, slopes_by_variations
 
 # The periods of an ensemble solve that are kept for its adjoint: where some of them begin and end, and the steps of the
@@ -150,15 +150,11 @@ class StepRecorder(Recorder):
         leaves = (lane_state.time, without_probe(lane_state).state, lane_state.length)
         return StepRecord(*(jnp.zeros((self.period, *leaf.shape), leaf.dtype) for leaf in leaves))
 
-    def has_room(self, record: StepRecord, iteration: Int[Array, ""]) -> Bool[Array, ""]:
-        return iteration < self.period
-
     def step(
         self, in_lanes: InLanes, lane_state: LaneState, record: StepRecord, iteration: Int[Array, ""]
     ) -> tuple[LaneState, StepRecord]:
         next_state = try_step(*in_lanes, lane_state)
-        tried_length = length_to_try(until_jump(*in_lanes[:2], lane_state), lane_state)
-        length = jnp.where(next_state.time > lane_state.time, tried_length, 0.0)
+        length = jnp.where(next_state.time > lane_state.time, length_to_try(*in_lanes[:2], lane_state), 0.0)
         entry = StepRecord(lane_state.time, without_probe(lane_state).state, length)
         return next_state, jax.tree.map(functools.partial(written_in_place, at=iteration), record, entry)
 

@@ -286,13 +286,9 @@ def _run(*leaves: Array, request: Request) -> list[Array]:
     return compiled(request.solve, request.selection, request.cells, arrays)
 
 
-@solve_cells.def_abstract_eval
-def _shaped(*leaves: ShapedArray, request: Request) -> list[ShapedArray]:
-    return [ShapedArray((request.cells, *kind.shape), kind.dtype) for kind in request.kinds]
-
-
-def _traced(*leaves: Array, request: Request) -> list[Array]:
-    return _parts(request.solve, request.selection, request.cells, leaves)
+solve_cells.def_abstract_eval(
+    lambda *leaves, request: [ShapedArray((request.cells, *kind.shape), kind.dtype) for kind in request.kinds]
+)
 
 
 def _batched(
@@ -456,7 +452,12 @@ def _transposed(
     return [None] * len(leaves) + shares
 
 
-mlir.register_lowering(solve_cells, mlir.lower_fun(_traced, multiple_results=True))
+mlir.register_lowering(
+    solve_cells,
+    mlir.lower_fun(
+        lambda *leaves, request: _parts(request.solve, request.selection, request.cells, leaves), multiple_results=True
+    ),
+)
 batching.primitive_batchers[solve_cells] = _batched
 partial_eval.dce_rules[solve_cells] = _only_read
 ad.primitive_jvps[solve_cells] = _jvp

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..compilation.xla_cpu import written_in_place
 from ..integration import AbstractProblem, CoreProblem, Lanes, LaneState, Settings, States, sample, solve_with_samples
 from ..integration.dense import SampledSolution
 from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, event_time
-from ..integration.samples import SampleTimes, components, step_towards_sample
+from ..integration.runge_kutta import Integers
+from ..integration.samples import Record, SampleTimes, components, step_towards_sample
 from ..integration.scheduler import NO_EXTREMES, InLanes
 from ..validation import as_number
 from .adjoint import StepRecord, StepRecorder, shares_of, solve_with_adjoint, time_of_zero, without_probe
@@ -70,44 +70,31 @@ class SampledCotangents(NamedTuple):
         return cls(jnp.concatenate(states, axis=-1), end_time, jnp.zeros((components, cells)))
 
 
-class SampledStepRecord(NamedTuple):
-    """The steps of a period; whether the last step was accepted, and the index of the next sample, in every lane."""
-
-    accepted: Bool[Array, "*lanes"]
-    sample: Int[Array, "*lanes"]
-    steps: StepRecord
-
-
 class SampledStepRecorder(StepRecorder):
     """Records steps that end on the samples; the cotangents of the samples enter where the steps end."""
 
     times: SampleTimes
     cotangents: SampledCotangents
 
-    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> SampledStepRecord:
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> Record:
         steps = super().begin(in_lanes, lane_state, collected)
         sample = self.times.after(lane_state.time, lane_state)
         samples, fixed = jnp.zeros(steps.length.shape, sample.dtype), jnp.zeros(steps.state.shape, bool)
-        return SampledStepRecord(jnp.ones(sample.shape, bool), sample, steps._replace(sample=samples, fixed=fixed))
+        return Record(jnp.ones(sample.shape, bool), sample, steps._replace(sample=samples, fixed=fixed))
 
     def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: SampledStepRecord, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, SampledStepRecord]:
-        accepted, sample, steps = record
-        next_state, length, is_sample = step_towards_sample(self.times, in_lanes, lane_state, accepted, sample)
-        has_moved, state = next_state.time > lane_state.time, without_probe(lane_state).state
-        entry = StepRecord(
-            lane_state.time,
-            state,
-            jnp.where(has_moved, length, 0.0),
-            jnp.where(is_sample, sample, len(self.times)),
-            next_state.state[len(state) :] == 0.0,
-        )
-        steps = jax.tree.map(functools.partial(written_in_place, at=iteration), steps, entry)
-        return next_state, SampledStepRecord(has_moved, sample + is_sample, steps)
+        self, in_lanes: InLanes, lane_state: LaneState, record: Record, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, Record]:
+        state = without_probe(lane_state).state
 
-    def steps(self, record: SampledStepRecord) -> StepRecord:
-        return record.steps
+        def entry(new_lanes: LaneState, length: Lanes, sample: Integers) -> StepRecord:
+            moved = jnp.where(new_lanes.time > lane_state.time, length, 0.0)
+            return StepRecord(lane_state.time, state, moved, sample, new_lanes.state[len(state) :] == 0.0)
+
+        return step_towards_sample(self.times, in_lanes, lane_state, record, iteration, entry)
+
+    def steps(self, record: Record) -> StepRecord:
+        return record.rows
 
     def arriving(self, lane_state: LaneState, steps: StepRecord) -> Float[Array, "iterations components lanes"]:
         assert steps.fixed is not None
@@ -592,29 +579,20 @@ class SingleSampling(AbstractSampling):
     def sampled(
         self, built: AbstractProblem, tangents: Tangents, horizon: Horizon, spec: ProblemSpec, nested: bool
     ) -> tuple[SampledRun, list[SampledRun]]:
-        samples = _follow(VariationalProblem(built, tangents, False), horizon, spec)
-        return jax.tree.map(lambda part: part[None], samples)
+        variational, (_, t1) = VariationalProblem(built, tangents, False), horizon
+        path = sample(variational, *horizon, spec.settings, grid=spec.grid)
+        ends = (path.end_time, path.end_state, _status(path, t1))
+        counts = (path.accepted, path.rejected, jnp.asarray(NO_EXTREMES))
+        samples, slopes = _found(variational, path.states.T, ends, counts)
 
+        def jump_times(problem: AbstractProblem) -> Array | None:
+            jumps = problem.jumps(jnp.zeros_like(t1), problem.start()[0])
+            return None if jumps is None else jumps.times
 
-def _follow(
-    variational: VariationalProblem, horizon: Horizon, spec: ProblemSpec
-) -> tuple[SampledRun, list[SampledRun]]:
-    """The samples of a run, and their derivative along each tangent."""
-    _, t1 = horizon
-    path = sample(variational, *horizon, spec.settings, grid=spec.grid)
-    ends = (path.end_time, path.end_state, _status(path, t1))
-    counts = (path.accepted, path.rejected, jnp.asarray(NO_EXTREMES))
-    samples, slopes = _found(variational, path.states.T, ends, counts)
-    problem = variational.problem
-
-    def jump_times(problem: AbstractProblem) -> Array | None:
-        jumps = problem.jumps(jnp.zeros_like(t1), problem.start()[0])
-        return None if jumps is None else jumps.times
-
-    for number, direction in enumerate(variational.tangents if jump_times(problem) is not None else ()):
-        # Diffrax's steps do not move with a jump.
-        moved = eqx.filter_jvp(jump_times, (problem,), (direction,))[1]
-        if moved is not None:
-            missing = jnp.where(jnp.any(moved != 0.0), jnp.nan, 0.0)
-            slopes[number] = jax.tree.map(lambda part, missing=missing: part + missing, slopes[number])
-    return samples, slopes
+        for number, direction in enumerate(tangents if jump_times(built) is not None else ()):
+            # Diffrax's steps do not move with a jump.
+            moved = eqx.filter_jvp(jump_times, (built,), (direction,))[1]
+            if moved is not None:
+                missing = jnp.where(jnp.any(moved != 0.0), jnp.nan, 0.0)
+                slopes[number] = jax.tree.map(lambda part, missing=missing: part + missing, slopes[number])
+        return jax.tree.map(lambda part: part[None], (samples, slopes))

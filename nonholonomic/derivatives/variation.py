@@ -18,6 +18,7 @@ from jax.interpreters import partial_eval
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..compilation.tracing import dependent_outputs
+from ..compilation.xla_cpu import traced_once
 from ..integration import AbstractProblem, Jumps, Lanes, Outcome, Settings, States, crossing_time, solve_ensemble
 from ..integration.problem import REACHED_END, RUNNING, AbstractDerivedProblem
 from ..integration.scheduler import LaneScheduler
@@ -70,10 +71,8 @@ def tangents_of(
     [1. 0.]
     """
 
-    def built(*numbers: Array) -> PyTree:
-        # A problem may also hold functions.
-        return eqx.filter(build(*numbers), eqx.is_inexact_array)
-
+    # A problem may also hold functions.
+    built = traced_once(lambda *numbers: eqx.filter(build(*numbers), eqx.is_inexact_array), *numbers)
     structure = jax.tree.structure(jax.eval_shape(built, *numbers))
     moving = jax.tree.unflatten(structure, dependent_outputs(built, *numbers))
     changes = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
@@ -170,10 +169,10 @@ def by_active(
             arguments[i] = leaf
         return build(tuple(arguments), cells)
 
-    return rebuilt, tuple(leaves[i] if cells is None else over_cells(leaves[i], cells) for i in active)
+    return rebuilt, tuple(leaves[i] if cells is None else with_cells(leaves[i], cells) for i in active)
 
 
-def over_cells(leaf: Float[Array, "..."], cells: int) -> Float[Array, "... cells"]:
+def with_cells(leaf: Float[Array, "..."], cells: int) -> Float[Array, "... cells"]:
     """A leaf with the cells in its last axis, from such a leaf or a scalar."""
     return jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], cells))
 
@@ -188,7 +187,7 @@ def tangent_along(
     **Returns:** the problem, the tangent, and the size of the direction in every cell.
     """
     rebuilt, point = by_active(build, active, leaves, cells)
-    directions = [over_cells(tangent, cells) for tangent in tangents]
+    directions = [with_cells(tangent, cells) for tangent in tangents]
     ratios = [jnp.abs(tangent) / tangent_scale(leaf) for tangent, leaf in zip(directions, point, strict=True)]
     size = functools.reduce(jnp.maximum, [jnp.max(ratio.reshape(-1, cells), axis=0) for ratio in ratios])
     scaled = tuple(jnp.where(size > 0.0, tangent / jnp.where(size > 0.0, size, 1.0), 0.0) for tangent in directions)
@@ -252,9 +251,6 @@ class VariationalProblem(AbstractDerivedProblem):
         return jnp.concatenate(
             [values, *(change(*direction) for direction in zip(self.tangents, variations, strict=True))]
         )
-
-    def event_function(self, state: States) -> Lanes | None:
-        return super().event_function(state) if self.ends_on_event else None
 
     def inner(self, state: States) -> Float[Array, "inner *lanes"]:
         return self.parts(state)[0]

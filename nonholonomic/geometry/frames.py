@@ -14,7 +14,7 @@ or cylinder is the same from both sides, except for the sign of its radius, whic
 
 import abc
 from collections.abc import Iterator
-from typing import NamedTuple, TypeAlias
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -155,13 +155,10 @@ class PlaneFrame(AbstractFrame):
 
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         zero = jnp.zeros_like(as_number(eta))
-        return self._along(zero, zero)
+        return self.at_foot((zero, zero))
 
     def at_foot(self, foot: Vector) -> tuple[Place, Place]:
-        return self._along(foot[0], foot[1])
-
-    def _along(self, x: Component, y: Component) -> tuple[Place, Place]:
-        return ((), (x, y)) if self.slope is None else ((x,), (y,))
+        return ((), foot[:2]) if self.slope is None else (foot[:1], foot[1:2])
 
     def place_scales(self, size: Component) -> Place:
         return () if self.slope is None else (size,)
@@ -201,23 +198,30 @@ class AbstractRoundFrame(AbstractFrame):
     """Inside or outside of a cylinder or a sphere.
 
     - `radius`: radius of the path of the centre [m], negative outside; `distance`: R [m].
+    - `side`: 1 inside, -1 outside.
     """
+
+    #: Whether the surface is curved along t2, too.
+    is_curved_along_t2: ClassVar[bool]
 
     radius: Float[Array, "..."]
     distance: Float[Array, "..."]
-    inside: bool = eqx.field(static=True, default=True)
+    side: float = eqx.field(static=True)
 
-    @property
-    def side(self) -> float:
-        """1 inside, -1 outside."""
-        return 1.0 if self.inside else -1.0
+    def place_scales(self, size: Component) -> Place:
+        return (1.0, 1.0, 1.0) if self.is_curved_along_t2 else (1.0, 1.0)
 
-    @abc.abstractmethod
-    def shape(self, curvature: Component) -> TangentOperator:
-        """The shape operator S [1/m] at a curvature [1/m]."""
+    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
+        up = self.vertical(place)
+        frame_rate = (velocity[0] / self.radius, velocity[1] / self.radius if self.is_curved_along_t2 else None)
+        # The place has the components of the vertical that do not vanish.
+        place_rate = tuple(rate for rate in rate_in_frame(up, frame_rate) if rate is not None)
+        return FrameMotion(frame_rate, up, place_rate)
 
     def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
-        contact_rate, _, room = contact_velocity(self.shape(1.0 / self.radius), radii, velocity)
+        curvature = 1.0 / self.radius
+        shape = (curvature, None, curvature if self.is_curved_along_t2 else None)
+        contact_rate, _, room = contact_velocity(shape, radii, velocity)
         return self.frame_motion(place, contact_rate)._replace(room=room), contact_rate
 
     def height(self, place: Place) -> Component:
@@ -231,6 +235,8 @@ class CylinderFrame(AbstractRoundFrame):
     Inside, c is eta and t1 points along growing eta; outside, c = eta - pi.
     """
 
+    is_curved_along_t2: ClassVar[bool] = False
+
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         eta = as_number(eta)
         return scale(self.side, (jnp.sin(eta), jnp.cos(eta))), (eta, jnp.zeros_like(eta))
@@ -239,17 +245,6 @@ class CylinderFrame(AbstractRoundFrame):
         x, y, z = foot
         place, (eta, _) = self.at_angle(jnp.arctan2(x, -z))
         return place, (eta, y)
-
-    def shape(self, curvature: Component) -> TangentOperator:
-        return (curvature, None, None)
-
-    def place_scales(self, size: Component) -> Place:
-        return (1.0, 1.0)
-
-    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        sine, cosine = place
-        rate = velocity[0] / self.radius
-        return FrameMotion((rate, None), self.vertical(place), (multiply(rate, cosine), -multiply(rate, sine)))
 
     def vertical(self, place: Place) -> Vector:
         sine, cosine = place
@@ -277,6 +272,8 @@ class SphereFrame(AbstractRoundFrame):
     The place is the vertical z seen in the frame; `cyclic` adds the horizontal x axis seen in it.
     """
 
+    is_curved_along_t2: ClassVar[bool] = True
+
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         eta = as_number(eta)
         zero, sine, cosine = jnp.zeros_like(eta), self.side * jnp.sin(eta), self.side * jnp.cos(eta)
@@ -286,16 +283,6 @@ class SphereFrame(AbstractRoundFrame):
         n = scale(-self.side / jnp.sqrt(dot(foot, foot)), foot)
         t1, t2 = tangents(n)
         return (t1[2], t2[2], n[2]), (t1[0], t2[0], n[0])
-
-    def shape(self, curvature: Component) -> TangentOperator:
-        return (curvature, None, curvature)
-
-    def place_scales(self, size: Component) -> Place:
-        return (1.0, 1.0, 1.0)
-
-    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        frame_rate = (velocity[0] / self.radius, velocity[1] / self.radius)
-        return FrameMotion(frame_rate, self.vertical(place), rate_in_frame(place, frame_rate))
 
     def vertical(self, place: Place) -> Vector:
         return tuple(place)
@@ -350,7 +337,7 @@ def frame_of(
         return PlaneFrame(distance, slope)
     if isinstance(surface, Cylinder | Sphere):
         kind = CylinderFrame if isinstance(surface, Cylinder) else SphereFrame
-        return kind(-side * surface.radius - distance, distance, side < 0.0)
+        return kind(-side * surface.radius - distance, distance, -side)
     return CarriedFrame.of(surface, distance, pull, side)
 
 
@@ -417,40 +404,23 @@ class CarriedFrame(AbstractFrame):
         return (size,) * 3 + (1.0,) * 3
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        axes, (S11, S12, S22) = self._bent(place)
-        R = self.distance
-        A11, A12, A22 = 1.0 - R * S11, -R * S12, 1.0 - R * S22
-        determinant = A11 * A22 - A12 * A12
-        q1 = (A22 * velocity[0] - A12 * velocity[1]) / determinant
-        q2 = (A11 * velocity[1] - A12 * velocity[0]) / determinant
-        # Both are positive if both values 1 - R k are; when the first of these vanishes, so does the determinant.
-        room = jnp.minimum(determinant, 0.5 * (A11 + A22))
-        return self._moved(place[:3], axes, (q1, q2), (S11 * q1 + S12 * q2, S12 * q1 + S22 * q2), room)
+        # The distance R is the radius of the ball that touches.
+        return self.convex_motion(place, velocity, (self.distance, None, self.distance))[0]
 
     def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
-        axes, shape = self._bent(place)
-        foot_velocity, frame_rate, room = contact_velocity(shape, radii, velocity)
-        return self._moved(place[:3], axes, foot_velocity, frame_rate, room), foot_velocity
-
-    def _bent(self, place: Place) -> tuple[tuple[Vector, Vector, Vector], TangentOperator]:
-        """The vectors t1, t2 and n in the surface's axes, and the shape operator of the arena."""
+        foot, zero = place[:3], jnp.zeros_like(place[0])
         # Stored, because otherwise each of the values below, and each of their derivatives, would compute these again.
-        n = stored(*self.normal(place[:3]))
+        n = stored(*self.normal(foot))
         # If the first tangent has drifted, only its direction along the surface counts.
         t1 = stored(*along(n, place[3:])[0])
         t2 = cross(n, t1)
-        bending, zero = scale(-self.side, self.surface.bending(place[:3], t1, t2)), jnp.zeros_like(place[0])
-        return (t1, t2, n), stored(*(zero if S is None else S for S in bending))
-
-    def _moved(
-        self, foot: Vector, axes: tuple[Vector, Vector, Vector], velocity: Tangent, frame_rate: Tangent, room: Component
-    ) -> FrameMotion:
-        """The motion of the frame. **Arguments:** `velocity`: velocity of the foot, along the axes."""
-        t1, t2, n = axes
-        o1, o2, *up = stored(*frame_rate, *(dot(axis, self.up) for axis in axes))
+        bending = scale(-self.side, self.surface.bending(foot, t1, t2))
+        shape = stored(*(zero if S is None else S for S in bending))
+        foot_velocity, frame_rate, room = contact_velocity(shape, radii, velocity)
+        o1, o2, *up = stored(*frame_rate, *(dot(axis, self.up) for axis in (t1, t2, n)))
         pull_back = -self.pull * self.side * self.surface.offset(foot)
-        carried = sum_vectors(scale(velocity[0], t1), scale(velocity[1], t2), scale(pull_back, n))
-        return FrameMotion((o1, o2), tuple(up), (*carried, *scale(o1, n)), room)
+        carried = sum_vectors(scale(foot_velocity[0], t1), scale(foot_velocity[1], t2), scale(pull_back, n))
+        return FrameMotion((o1, o2), tuple(up), (*carried, *scale(o1, n)), room), foot_velocity
 
     def own_axes(self, place: Place) -> tuple[Vector, Vector, Vector]:
         """The vectors t1, t2 and n in the surface's axes."""

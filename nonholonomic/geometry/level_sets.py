@@ -11,6 +11,7 @@ Optimization, chapter 4). A last Newton step carries the derivatives (implicit f
 """
 
 import abc
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -24,7 +25,7 @@ from ..compilation.components import Held
 from ..compilation.tracing import with_own_numbers
 from ..text import parted, shown
 from ..validation import UNTRACEABLE, Bound, as_number, is_traced
-from .surface import DIVIDED, OPEN, AbstractGradientSurface, AbstractSurface, BallGap, Place
+from .surface import DIVIDED, NEWTON_STEPS, OPEN, TINY, AbstractGradientSurface, AbstractSurface, BallGap, Place
 from .vector import Component, Vector, difference, dot, scale, sum_vectors, tangents, unit
 
 # User functions for surfaces: convert them to modules with visible parameters, check them, and differentiate them.
@@ -86,13 +87,8 @@ def _takes_lanes(function: Any, count: int) -> bool:
 
 def partials(function: Callable[..., Component], at: Vector) -> Vector:
     """Partial derivatives of a function of several numbers, each a number or an array over lanes."""
-
-    def along(k: int) -> Float[Array, "..."]:
-        return jax.jvp(
-            lambda coordinate: function(*at[:k], coordinate, *at[k + 1 :]), (at[k],), (jnp.ones_like(at[k]),)
-        )[1]
-
-    return tuple(along(k) for k in range(len(at)))
+    alone = [lambda x, k=k: function(*at[:k], x, *at[k + 1 :]) for k in range(len(at))]
+    return tuple(jax.jvp(along, (x,), (jnp.ones_like(x),))[1] for along, x in zip(alone, at, strict=True))
 
 
 def second_derivative(function: Callable[..., Component], at: Vector, a: Vector, b: Vector) -> Float[Array, "..."]:
@@ -129,12 +125,14 @@ def newton_step(a: Component, b: Component, c: Component, x: Component, y: Compo
 
 
 class Descent(NamedTuple):
-    """The state of a search: a vector, its value, the longest step allowed next, and whether the search has ended."""
+    """The state of a search: a vector, its value, the longest step allowed next, whether the search has ended, and the number
+    of iterations."""
 
     point: Float[Array, "3 ..."]
     value: Float[Array, "..."]
     reach: Float[Array, "..."]
     ended: Bool[Array, "..."]
+    count: Int[Array, ""]
 
 
 def descended(
@@ -154,12 +152,7 @@ def descended(
     - `start`: a vector on the surface; `size`: unit for steps; `reach`: the longest first step.
     """
 
-    def going_on(carry: tuple[Descent, Int[Array, ""]]) -> Bool[Array, ""]:
-        descent, count = carry
-        return ~jnp.all(descent.ended) & (count < MOST_ITERATIONS)
-
-    def descend(carry: tuple[Descent, Int[Array, ""]]) -> tuple[Descent, Int[Array, ""]]:
-        descent, count = carry
+    def descend(descent: Descent) -> Descent:
         point = tuple(descent.point)
         s1, s2, t1, t2 = step(point)
         length = jnp.sqrt(s1 * s1 + s2 * s2)
@@ -170,18 +163,20 @@ def descended(
         accepted = improves & ~descent.ended
         # NaN ends the search, too.
         ended = descent.ended | ~(length > SETTLED * size)
-        new = Descent(
+        return Descent(
             point=jnp.where(accepted, _stacked(trial), descent.point),
             value=jnp.where(accepted, trial_value, descent.value),
             reach=jnp.where(improves, 2.0, 0.25) * descent.reach,
             ended=ended,
+            count=descent.count + 1,
         )
-        return new, count + 1
 
     first = _stacked(start)
     zero = jnp.zeros_like(first[0])
-    initial = Descent(first, value(start) + zero, reach + zero, zero > 0.0)
-    minimum, _ = jax.lax.while_loop(going_on, descend, (initial, jnp.zeros((), int)))
+    initial = Descent(first, value(start) + zero, reach + zero, zero > 0.0, jnp.zeros((), int))
+    minimum = jax.lax.while_loop(
+        lambda descent: ~jnp.all(descent.ended) & (descent.count < MOST_ITERATIONS), descend, initial
+    )
     return tuple(minimum.point)
 
 
@@ -228,10 +223,7 @@ class AbstractLevel(AbstractGradientSurface):
         # A start that is off the surface, on the position's side, could be nearer than every point of the surface.
         first = surface.onto(surface.onto(place))
         distance = jnp.sqrt(_square(place, first))
-        starts = jnp.asarray(self.starts)
-
-        def step(foot: Vector) -> tuple[Component, Component, Vector, Vector]:
-            return surface._step_on_surface(place, foot)
+        starts, step = jnp.asarray(self.starts), functools.partial(surface._step_on_surface, place)
 
         def in_sector(k: Int[Array, ""], nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
             def start(i: Int[Array, ""], nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
@@ -253,13 +245,8 @@ class AbstractLevel(AbstractGradientSurface):
     def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
         surface, place, size = _held(self), jax.lax.stop_gradient(centre), jax.lax.stop_gradient(radius)
 
-        def step(normal: Vector) -> tuple[Component, Component, Vector, Vector]:
-            return surface._step_on_ball(place, size, normal)
-
-        def value(normal: Vector) -> Component:
-            return surface.level(_lowered(place, size, normal))
-
-        normal = descended(step, unit, value, surface.normal(place), 1.0, 0.5)
+        step, start = functools.partial(surface._step_on_ball, place, size), surface.normal(place)
+        normal = descended(step, unit, lambda normal: surface.level(_lowered(place, size, normal)), start, 1.0, 0.5)
         s1, s2, t1, t2 = self._step_on_ball(centre, radius, normal)
         normal = unit(sum_vectors(normal, scale(s1, t1), scale(s2, t2)))
         minimum = _lowered(centre, radius, normal)
@@ -306,12 +293,6 @@ def _lowered(position: Vector, distance: Component, normal: Vector) -> Vector:
 
 # Open surfaces: the paraboloid and the graph of any smooth function.
 
-#: Newton steps to the nearest point of a paraboloid, from above: enough for the worst positions.
-NEWTON_STEPS = 12
-
-#: A negligible distance [m], to avoid division by zero.
-TINY = 1e-100
-
 
 class AbstractOpen(AbstractSurface):
     """A surface above the whole x-y plane.
@@ -324,9 +305,6 @@ class AbstractOpen(AbstractSurface):
 
     def place_at(self, position: Vector) -> Place:
         return position[:2]
-
-    def elevation(self, position: Vector) -> Component:
-        return position[2]
 
     def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
         x, y = jnp.broadcast_arrays(*place)
@@ -514,9 +492,6 @@ class Implicit(AbstractLevel):
 
     def level(self, position: Vector) -> Component:
         return self.function(*position)
-
-    def elevation(self, position: Vector) -> Component:
-        return position[2]
 
     def place_at(self, position: Vector) -> Place:
         return tuple(position)

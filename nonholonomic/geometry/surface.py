@@ -127,9 +127,9 @@ class AbstractSurface(Bounded):
         by_a, by_b = self.normal_rate(position, a), self.normal_rate(position, b)
         return dot(a, by_a), dot(b, by_a), dot(b, by_b)
 
-    @abc.abstractmethod
     def elevation(self, position: Vector) -> Component:
-        """Height [m] of a position: above the lowest point, or above the origin of a surface that has none."""
+        """Height [m] of a position: above the lowest point, or above the origin, the default, of a surface that has none."""
+        return position[2]
 
     @abc.abstractmethod
     def gaussian_curvature(self, position: Vector) -> Component:

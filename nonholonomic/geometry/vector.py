@@ -196,10 +196,6 @@ _departure.def_abstract_eval(lambda dx, dy: ShapedArray(dx.shape, dx.dtype))
 mlir.register_lowering(_departure, mlir.lower_fun(lambda dx, dy: jnp.hypot(dx, dy), multiple_results=False))
 
 
-def _second_change(primals: tuple[Array, Array], tangents: tuple[Array | ad.Zero, ...]) -> tuple[Array, Array]:
-    return jax.jvp(planar_length, primals, tuple(ad.instantiate_zeros(tangent) for tangent in tangents))
-
-
 def _taken_back(cotangent: Array | ad.Zero, dx: Array | ad.UndefinedPrimal, dy: Array | ad.UndefinedPrimal) -> Vector:
     if isinstance(cotangent, ad.Zero):
         return None, None
@@ -207,6 +203,8 @@ def _taken_back(cotangent: Array | ad.Zero, dx: Array | ad.UndefinedPrimal, dy: 
     return tuple(doubt if ad.is_undefined_primal(part) else None for part in (dx, dy))
 
 
-ad.primitive_jvps[_departure] = _second_change
+ad.primitive_jvps[_departure] = lambda primals, tangents: jax.jvp(
+    planar_length, primals, tuple(map(ad.instantiate_zeros, tangents))
+)
 ad.primitive_transposes[_departure] = _taken_back
 batching.defbroadcasting(_departure)

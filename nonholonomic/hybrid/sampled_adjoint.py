@@ -33,8 +33,7 @@ from ..derivatives.sampled_runs import (
     samples_pulled_back,
     solve_for_samples,
 )
-from ..derivatives.variation import Tangent, by_active, where_active
-from ..derivatives.variation import over_cells as with_cells
+from ..derivatives.variation import Tangent, by_active, where_active, with_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
 from ..integration.scheduler import of_cells
@@ -59,6 +58,7 @@ from .samples import (
     HybridSamples,
     Recorded,
     derivative,
+    output_rows,
     reset_with_rows,
     sampled_rounds,
     sampled_with_tangents,
@@ -317,12 +317,8 @@ def hybrid_samples_pulled_back(
     start = at_start(first, states, cells, counters + 1)
     (runs, output), groups, solve, reset = sampled_rounds(variational, start, times, t1, settings, 2)
     # At the start, only the output rows that the tangent moves count.
-    rates = [
-        over_cells(lambda mode, states: mode.output_rows(states)[1][0], mode)(states[:, None]) for mode in variational
-    ]
-    rate = rates[0]
-    for number, of_mode in enumerate(rates):
-        rate = jnp.where(first == number, of_mode, rate)
+    initial = output._replace(state=states[:, None], number=first[None], between=None)
+    _, (rate,) = output_rows(variational, initial)
     shown = jnp.where((times <= 0.0) & (rate == 0.0), 0.0, shown)
     passes = Passes(variational, groups, (solve, reset), (times, t1), settings, shown, end_time)
     count, no_cells = jnp.zeros((), int), jnp.zeros(cells, bool)

@@ -271,11 +271,6 @@ def _start(
     return jnp.asarray(state), jnp.asarray(scales), problem.margin_at_start(time, state)
 
 
-def _field(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array, " components"]) -> diffrax.ODETerm:
-    """The field for Diffrax, whose argument is the problem: traced once, where Diffrax would trace it several times."""
-    return diffrax.ODETerm(eqx.filter_closure_convert(lambda *args: problem.field(*args[:2]), time, state, problem))
-
-
 def _control(
     problem: AbstractProblem,
     settings: Settings,
@@ -308,9 +303,11 @@ def _solved(
 
     **Arguments:** `times`: start, end and length of the first step [s]; `options`: of `diffrax.diffeqsolve`.
     """
-    field = _field(problem, jnp.asarray(times[0], state.dtype), state)
+    # Traced once, where Diffrax would trace the field several times.
+    begin = jnp.asarray(times[0], state.dtype)
+    field = eqx.filter_closure_convert(lambda time, state, _: problem.field(time, state), begin, state, problem)
     options = {"args": problem, "stepsize_controller": control, "throw": False, **options}
-    return diffrax.diffeqsolve(field, solver, *times, state, **options)
+    return diffrax.diffeqsolve(diffrax.ODETerm(field), solver, *times, state, **options)
 
 
 @eqx.filter_jit
@@ -368,8 +365,6 @@ def follow(
     t1: float,
     settings: Settings,
     *,
-    first: float | None = None,
-    t0: float = 0.0,
     dense: bool = True,
     piece: int = PIECE,
 ) -> DenseSolution:
@@ -381,8 +376,6 @@ def follow(
     - `t1`: horizon [s].
     - `settings`: their solver can be any solver of Diffrax. A run that needs more than `max_steps` steps, including
       rejected ones, fails.
-    - `first`: length of the first step [s], by default `FIRST_STEP`.
-    - `t0`: time at which the run starts [s].
     - `dense`: whether to keep dense output for states within the steps (`DenseSolution.at`).
     - `piece`: number of steps that are integrated at once.
 
@@ -397,11 +390,9 @@ def follow(
     >>> print(path.at(np.array([0.5, 1.0])).round(6))  # exp(-1), exp(-2)
     [[0.367879 0.135335]]
     """
-    time, end = jnp.asarray(t0, float), jnp.asarray(t1, float)
+    time, end, length = jnp.asarray(0.0, float), jnp.asarray(t1, float), jnp.asarray(FIRST_STEP, float)
     state, scales, margin = _start(problem, time)
-    # Always a number, so that the program serves the first piece of a run and the later ones.
-    length = jnp.asarray(FIRST_STEP if first is None else first, float)
-    times, states, segments = [np.full(1, t0)], [np.asarray(state)[:, None]], []
+    times, states, segments = [np.zeros(1)], [np.asarray(state)[:, None]], []
     accepted, rejected, lost, failed = 0, 0, False, False
     # The program is compiled for this number of steps, so it must not change with the number that is left.
     piece_settings = dataclasses.replace(settings, max_steps=min(piece, settings.max_steps))

@@ -18,6 +18,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
+from ..compilation.xla_cpu import traced_once
 from ..parameters import numbers
 from ..text import shown
 from ..validation import (
@@ -231,6 +232,9 @@ class AbstractProblem(eqx.Module):
 class AbstractDerivedProblem(AbstractProblem):
     """A problem with more or fewer components than another one, which decides where its runs end and jump."""
 
+    #: Whether runs end on the event of the other problem.
+    ends_on_event = True
+
     problem: eqx.AbstractVar[AbstractProblem]
 
     @abc.abstractmethod
@@ -250,7 +254,7 @@ class AbstractDerivedProblem(AbstractProblem):
         return self.problem.fast
 
     def event_function(self, state: States) -> Lanes | None:
-        return self.problem.event_function(self.inner(state))
+        return self.problem.event_function(self.inner(state)) if self.ends_on_event else None
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         return self.problem.domain_margin(time, self.inner(state))
@@ -329,10 +333,8 @@ def event_time(problem: AbstractProblem, function: Callable[[States], PyTree], t
     and the series t - g/g' - g'' g^2 / (2 g'^3) turns its variation into that of the time (implicit function theorem).
     """
 
-    def slope(point: States) -> Lanes:
-        return jax.jvp(function, (point,), (problem.field(time, point),))[1]
-
-    first, second = jax.jvp(slope, (state,), (problem.field(time, state),))
+    field = traced_once(lambda point: problem.field(time, point), state)
+    first, second = jax.jvp(lambda point: jax.jvp(function, (point,), (field(point),))[1], (state,), (field(state),))
     first = jnp.where(first == 0.0, 1.0, first)
     shift = function(state) / first
     return time_at_jump(problem, time, state, time - shift - 0.5 * second / first * shift * shift)
@@ -506,10 +508,6 @@ class Settings(eqx.Module):
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
         """The same settings with another tolerance, or without a tolerance if the caller stores it."""
         return eqx.tree_at(lambda settings: settings.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
-
-    def lanes_of(self, cells: int) -> int:
-        """Number of a problem's cells that advance together."""
-        return lanes_for(cells) if self.lanes is None else self.lanes
 
 
 def lanes_for(cells: int) -> int:
@@ -730,6 +728,3 @@ class ExtendedProblem(AbstractDerivedProblem, Generic[Core]):
 
     def inner(self, state: States) -> Float[Array, "inner *lanes"]:
         return state[: len(state) - len(self.values)]
-
-    def event_function(self, state: States) -> Lanes | None:
-        return super().event_function(state) if self.ends_on_event else None

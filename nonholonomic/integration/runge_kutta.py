@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compilation.xla_cpu import written_by_component, written_in_place
+from ..compilation.xla_cpu import traced_once, written_by_component, written_in_place
 from ..text import shown
 
 Lanes = Float[Array, "*lanes"]
@@ -114,6 +114,7 @@ def explicit_step(
 
     **Returns:** a `Step`.
     """
+    field, crossing = traced_once(field, time + length, state), traced_once(crossing, state, rate)
     inner = inner_stages(tableau)
     places, is_look = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
     rows = jnp.asarray(np.searchsorted(looks, np.arange(inner)) + 1)
@@ -132,6 +133,7 @@ def explicit_step(
 
     history = None
     if margins_before is not None:
+        margins = traced_once(margins, time + length, state)
         history = jnp.zeros((2 + len(looks), *margins_before.shape), margins_before.dtype)
         history = written_in_place(history, margins_before, at=jnp.zeros((), int))
     stages, history = over_stages(inner, do, (stages, history))

@@ -19,7 +19,7 @@ from ..compilation.xla_cpu import written_in_place
 from .problem import FAILED, REACHED_END, RUNNING, AbstractProblem, Settings
 from .runge_kutta import AbstractTunedPair, Integers, Lanes, Mask, States, weighted_sum
 from .scheduler import InLanes, LaneScheduler, Outcome, Recorder
-from .step import LaneState, after_step, length_to_try, past_jump, trial_step, try_step, until_jump
+from .step import LaneState, before_jump, length_to_try, past_jump, trial_step, try_step, until_jump
 
 # The times at which the cells of a problem are sampled, and the samples so far.
 
@@ -250,9 +250,9 @@ class DenseSampleRecorder(AbstractSampleRecorder):
         problem, control, atol = in_lanes
         furthest_time = self.times.time_of(record.sample + MAX_SAMPLES_IN_STEP - 1, lane_state)
         lane_state = lane_state._replace(length=jnp.minimum(lane_state.length, furthest_time - lane_state.time))
+        length, trial = trial_step(problem, control, lane_state)
         near = until_jump(problem, control, lane_state)
-        length, trial = trial_step(problem, near, lane_state)
-        near_lanes = after_step(problem, near, atol, lane_state, length, trial)
+        near_lanes = before_jump(problem, near, atol, lane_state, length, trial)
         new_lanes = past_jump(problem, control, near, lane_state, near_lanes)
         length = stop_gradient(length)
         end_time = lane_state.time + length
@@ -286,12 +286,12 @@ STRETCH = 1.08
 
 
 class Record(NamedTuple):
-    """Record of a period: whether the last step was accepted and the number of the next sample, in every lane; after each
-    iteration the states, and the numbers of the samples there, if any."""
+    """Record of a period: whether the last step was accepted and the index of the next sample, in every lane; and what is kept
+    of each iteration, a tree of arrays (rows, ...)."""
 
     accepted: Mask
     sample: Integers
-    rows: Rows
+    rows: PyTree
 
 
 class SampleRecorder(AbstractSampleRecorder):
@@ -304,30 +304,28 @@ class SampleRecorder(AbstractSampleRecorder):
         accepted = jnp.ones(collected.sample.shape, bool)
         return Record(accepted, collected.sample, self.empty_rows(self.period, lane_state))
 
-    def has_room(self, record: Record, iteration: Int[Array, ""]) -> Bool[Array, ""]:
-        return iteration < self.period
-
     def step(
         self, in_lanes: InLanes, lane_state: LaneState, record: Record, iteration: Int[Array, ""]
     ) -> tuple[LaneState, Record]:
-        accepted, sample, rows = record
-        new_lanes, _, is_sample = step_towards_sample(self.times, in_lanes, lane_state, accepted, sample)
-        entry = Rows(new_lanes.state, jnp.where(is_sample, sample, len(self.times)))
-        rows = jax.tree.map(functools.partial(written_in_place, at=iteration), rows, entry)
-        return new_lanes, Record(new_lanes.time > lane_state.time, sample + is_sample, rows)
+        arguments = (self.times, in_lanes, lane_state, record, iteration)
+        return step_towards_sample(*arguments, lambda new_lanes, _, sample: Rows(new_lanes.state, sample))
 
 
 def step_towards_sample(
-    times: SampleTimes, in_lanes: InLanes, lane_state: LaneState, accepted: Mask, sample: Integers
-) -> tuple[LaneState, Lanes, Mask]:
-    """Try a step in every lane that does not pass its next sample.
+    times: SampleTimes,
+    in_lanes: InLanes,
+    lane_state: LaneState,
+    record: Record,
+    iteration: Int[Array, ""],
+    entry: Callable[[LaneState, Lanes, Integers], PyTree],
+) -> tuple[LaneState, Record]:
+    """Try a step in every lane that does not pass its next sample, and record it.
 
-    **Arguments:** `accepted`: whether the previous step was accepted; `sample`: the index of the next sample.
-
-    **Returns:** the lanes after the step; the length that was tried [s]; and whether the step ended on the sample.
+    **Arguments:** as for `Recorder.step`; `entry`: function of the lanes after the step, of the length that was tried [s], and
+    of the index of the sample on which each step ended, or the number of samples, that returns what to keep.
     """
     problem, control, atol = in_lanes
-    next_time = times.time_of(sample, lane_state)
+    next_time = times.time_of(record.sample, lane_state)
     control_to_target = control._replace(t1=jnp.minimum(next_time, control.t1))
     # Even lengths up to the sample or, if it comes first, to the jump.
     target = until_jump(problem, control_to_target, lane_state).t1
@@ -337,14 +335,17 @@ def step_towards_sample(
     fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, jnp.minimum(length, left)))
     even_length = jnp.where(lane_state.bracketing, length, fitting)
     # The step after a rejected step is shorter on purpose, because it may have to end on a minimum of a margin.
-    lane_state = lane_state._replace(length=jnp.where(accepted, even_length, jnp.minimum(even_length, length)))
+    lane_state = lane_state._replace(length=jnp.where(record.accepted, even_length, jnp.minimum(even_length, length)))
     new_lanes = try_step(problem, control_to_target, atol, lane_state)
     at_target = (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END)
     goes_on = at_target & (new_lanes.time < control.t1)
     status = jnp.where(new_lanes.steps < control.max_steps, RUNNING, FAILED)
     new_lanes = new_lanes._replace(status=jnp.where(goes_on, status, new_lanes.status))
-    tried_length = length_to_try(until_jump(problem, control_to_target, lane_state), lane_state)
-    return new_lanes, tried_length, at_target & (new_lanes.time >= next_time)
+    tried_length = length_to_try(problem, control_to_target, lane_state)
+    is_sample = at_target & (new_lanes.time >= next_time)
+    row = entry(new_lanes, tried_length, jnp.where(is_sample, record.sample, len(times)))
+    rows = jax.tree.map(functools.partial(written_in_place, at=iteration), record.rows, row)
+    return new_lanes, Record(new_lanes.time > lane_state.time, record.sample + is_sample, rows)
 
 
 def solve_with_samples(

@@ -14,10 +14,10 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from ..compilation.xla_cpu import compiled_alone, in_one_kernel
+from ..compilation.xla_cpu import compiled_alone, in_one_kernel, traced_once
 from ..text import shown
 from .events import Bracket
-from .problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, Settings, crossing_time
+from .problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, Settings, crossing_time, lanes_for
 from .runge_kutta import Integers, Lanes, States, explicit_tableau, first_length, memory_for_stages
 from .step import Control, LaneState, try_step
 
@@ -87,10 +87,11 @@ class Recorder(eqx.Module):
     """The part of a solve that records steps, in addition to the `Outcome`; this one records nothing. A period ends when
     enough lanes have ended to refill them, or when the record is full.
 
-    `refill_cost`: cost of a refill, in steps of all lanes.
+    `refill_cost`: cost of a refill, in steps of all lanes; `period`: the most iterations of a period, `None` for any number.
     """
 
     refill_cost: ClassVar[float] = REFILL
+    period: ClassVar[int | None] = None
 
     def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: PyTree) -> PyTree:
         """The record at the start of a period, from what earlier periods have collected."""
@@ -98,7 +99,7 @@ class Recorder(eqx.Module):
 
     def has_room(self, record: PyTree, iteration: Int[Array, ""]) -> Bool[Array, ""] | bool:
         """Whether the record has room for another iteration of the period; otherwise the period ends."""
-        return True
+        return True if self.period is None else iteration < self.period
 
     def step(
         self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]
@@ -151,15 +152,17 @@ class LaneScheduler(eqx.Module):
         control = Control(tableau, order, rtol, t1, settings.max_steps, nonterminal, n_blocks)
         states, scales = problem.start()
         begin = jnp.zeros_like(states[0])
+        field = traced_once(problem.field, begin, states)
         if (jumps := problem.jumps(begin, states)) is not None:
             # Beyond a jump at the start, also by a clock in the state.
-            states = states + jumps.begin(begin) * problem.field(begin, states)
+            states = states + jumps.begin(begin) * field(begin, states)
             begin = jumps.begin(begin)
-        rates, atols = problem.field(begin, states), settings.absolute * rtol * scales
-        lengths = first_length(problem.field, begin, states, rates, control.order, rtol, atols, n_blocks)
+        rates, atols = field(begin, states), settings.absolute * rtol * scales
+        lengths = first_length(field, begin, states, rates, control.order, rtol, atols, n_blocks)
         fresh = _fresh_lanes(problem, control, states, rates, jnp.minimum(stop_gradient(lengths), t1))
         fresh = fresh._replace(time=begin)
-        return cls(problem, control, atols, fresh, cells, settings.lanes_of(states.shape[1]), one_kernel)
+        lanes = lanes_for(states.shape[1]) if settings.lanes is None else settings.lanes
+        return cls(problem, control, atols, fresh, cells, lanes, one_kernel)
 
     @property
     def capacity(self) -> int:

@@ -97,11 +97,11 @@ class LaneState(NamedTuple):
     stages: Stages | None = None
 
 
-def length_to_try(control: Control, lane_state: LaneState) -> Lanes:
-    """Length of each lane's next step [s]: the last one ends exactly on the horizon, even where round-off would miss
-    it.
+def length_to_try(problem: AbstractProblem, control: Control, lane_state: LaneState) -> Lanes:
+    """Length of each lane's next step [s]: the last one before a jump or the horizon ends exactly there, even where round-off
+    would miss it.
     """
-    left = control.t1 - lane_state.time
+    left = until_jump(problem, control, lane_state).t1 - lane_state.time
     return jnp.where(~lane_state.bracketing & (lane_state.length >= left * (1.0 - 1e-12)), left, lane_state.length)
 
 
@@ -117,9 +117,7 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
 
     **Returns:** the lanes after the step.
     """
-    near = until_jump(problem, control, lane_state)
-    new_lanes = after_step(problem, near, atol, lane_state, *trial_step(problem, near, lane_state))
-    return past_jump(problem, control, near, lane_state, new_lanes)
+    return after_step(problem, control, atol, lane_state, *trial_step(problem, control, lane_state))
 
 
 def until_jump(problem: AbstractProblem, control: Control, lane_state: LaneState) -> Control:
@@ -169,7 +167,7 @@ def past_jump(
 
 def trial_step(problem: AbstractProblem, control: Control, lane_state: LaneState) -> tuple[Lanes, Step]:
     """The length of each lane's next step [s], and the step."""
-    tried_length = length_to_try(control, lane_state)
+    tried_length = length_to_try(problem, control, lane_state)
     crossing = functools.partial(problem.crossing_on, lane_state.side)
     start = (lane_state.time, lane_state.state, lane_state.rate, tried_length, lane_state.margins)
     stages = memory_for_stages(control.tableau, lane_state.state) if lane_state.stages is None else lane_state.stages
@@ -186,12 +184,22 @@ def looks_of(problem: AbstractProblem, tableau: diffrax.ButcherTableau, lane_sta
 def after_step(
     problem: AbstractProblem, control: Control, atol: States, lane_state: LaneState, tried_length: Lanes, trial: Step
 ) -> LaneState:
-    """Update each lane after a trial step.
+    """Update each lane after a trial step, and move it across a jump on which the step ended.
 
     **Arguments:** as for `try_step`; `tried_length` contains the lengths of the steps [s], and `trial` their results.
 
     **Returns:** the lanes after the step.
     """
+    near = until_jump(problem, control, lane_state)
+    new_lanes = before_jump(problem, near, atol, lane_state, tried_length, trial)
+    return past_jump(problem, control, near, lane_state, new_lanes)
+
+
+def before_jump(
+    problem: AbstractProblem, control: Control, atol: States, lane_state: LaneState, tried_length: Lanes, trial: Step
+) -> LaneState:
+    """The lanes after a trial step, on the near side of a jump. **Arguments:** as for `after_step`; `control`: as from
+    `until_jump`."""
     running = lane_state.status == RUNNING
     free = running & ~lane_state.bracketing
     error = scaled_error(

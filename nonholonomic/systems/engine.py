@@ -8,7 +8,7 @@ time is an additional component of the state.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Components, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from ..runs.event import UNMEASURED
-from .form import Form, OfRun, State
+from .form import Form, State
 
 #: A function counts as zero if changing every component of the state by this fraction of its size could make it zero:
 #: round-off.
@@ -46,6 +46,9 @@ class ModeProblem(AbstractProblem):
     `jump_times`: the readings of the clock in the state at which a function of the mode may jump; `allowances`: for each
     margin an allowance for errors of the start, zero where the mode does not begin on the margin.
     """
+
+    direction_decides: ClassVar[bool] = True
+    fast: ClassVar[tuple[bool, bool]] = True, True
 
     numbers: tuple[Float[Array, "..."], ...]
     states: Float[Array, "components *cells"]
@@ -81,28 +84,20 @@ class ModeProblem(AbstractProblem):
         return dataclasses.replace(problem, allowances=stop_gradient(allowances))
 
     @property
-    def direction_decides(self) -> bool:
-        return True
-
-    @property
     def fits_one_kernel(self) -> bool:
         return self.form.traits.elementary
-
-    @property
-    def fast(self) -> tuple[bool, bool]:
-        return True, True
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 
     def field(self, time: Lanes, state: Components) -> States:
-        rates_of = _rates_out_of_line if self.form.traits.large[self.mode] else _rates
-        rates = rates_of(self.form, self.mode, self.numbers, tuple(state))
+        evaluate = _in_lanes_out_of_line if self.form.traits.large[self.mode] else _in_lanes
+        rates = evaluate(self.form, "field", self.mode, self.numbers, tuple(state))
         clock = (jnp.ones_like(state[0]),) if self.form.traits.depends_on_time else ()
         return jnp.stack((*rates, *clock))
 
     def event_function(self, state: States) -> Lanes | None:
-        return self._over_lanes(self.form.function("event"), state) if self.form.has_event else None
+        return _in_lanes(self.form, "event", 0, self.numbers, tuple(state)) if self.form.has_event else None
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         margins = self.margins(time, state)
@@ -132,7 +127,7 @@ class ModeProblem(AbstractProblem):
 
     def _margins(self, state: States) -> tuple[Lanes, ...]:
         """The margins without allowances."""
-        return self._over_lanes(self.form.function("margins", self.mode), state)
+        return _in_lanes(self.form, "margins", self.mode, self.numbers, tuple(state))
 
     def _at_start(self) -> tuple[Array, ...]:
         """The margins at the start; their slopes along the motion; the errors of both if the error of every component is the
@@ -179,14 +174,6 @@ class ModeProblem(AbstractProblem):
     def jumps(self, time: Lanes, state: States) -> Jumps | None:
         return None if self.jump_times is None else Jumps.at(self.jump_times, state[-1] - time)
 
-    def _over_lanes(self, function: OfRun, state: States) -> PyTree:
-        """A user's function, evaluated in every lane."""
-
-        def of_run(numbers: Sequence[Array], parts: tuple[Array, ...]) -> PyTree:
-            return function(numbers, *time_and_state(self.form, parts))
-
-        return over_lanes(of_run, self.numbers, tuple(state))
-
 
 def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:
     """Time and state of a run, from its components; the time is a placeholder if nothing depends on it."""
@@ -195,17 +182,19 @@ def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:
     return jnp.asarray(jnp.nan), jnp.stack(parts)
 
 
-def _rates(form: Form, mode: int, numbers: Sequence[Array], parts: tuple[Array, ...]) -> tuple[Lanes, ...]:
-    """The field of a mode in every lane, from the components of the states."""
+def _in_lanes(form: Form, name: str, mode: int, numbers: Sequence[Array], parts: tuple[Array, ...]) -> PyTree:
+    """A user's function (`Form.function`) in every lane, from the components of the states; rates are returned as components,
+    too."""
 
-    def of_run(numbers: Sequence[Array], parts: tuple[Array, ...]) -> tuple[Array, ...]:
-        return tuple(form.function("field", mode)(numbers, *time_and_state(form, parts)))
+    def of_run(numbers: Sequence[Array], parts: tuple[Array, ...]) -> PyTree:
+        values = form.function(name, mode)(numbers, *time_and_state(form, parts))
+        return tuple(values) if name == "field" else values
 
     return over_lanes(of_run, tuple(numbers), parts)
 
 
 #: A large field is a function of its own in every program, which JAX traces, differentiates and lowers once.
-_rates_out_of_line = jax.jit(_rates, static_argnums=(0, 1))
+_in_lanes_out_of_line = jax.jit(_in_lanes, static_argnums=(0, 1, 2))
 
 
 class BatchedMode(AbstractBatchedMode):

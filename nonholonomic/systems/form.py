@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..compilation.components import spelled_out
 from ..compilation.tracing import depends_on_first, is_elementary, jumps_of, named_errors, warn_of_unclear
-from ..compilation.xla_cpu import Function, opened, programs_in, traced
+from ..compilation.xla_cpu import Function, equations_in, traced
 from ..parameters import TreeForm
 from ..text import described, shown
 from ..validation import as_number, require, warn
@@ -263,17 +263,13 @@ class Form:
         tree, numbers = TreeForm.of(hybrid)
         return cls(tree, len(hybrid.modes), hybrid.first, hybrid.event is not None, size), numbers
 
-    def system(self, numbers: Sequence[Array]) -> Hybrid:
-        """The system with the given numbers, each a scalar."""
-        return self.tree.tree(numbers)
-
     def function(self, name: str, mode: int = 0) -> OfRun:
         """One of the user's functions: "field", "margin" or "reset" of a mode, or "event"; "margins", the values of the margin
         as a tuple; or "entered", which projects the state after a reset to a mode onto its constraints. A reset also receives
         the index of the margin that fell."""
 
         def called(numbers: Sequence[Array], t: Array, y: State, exit: ArrayLike = 0) -> PyTree:
-            system = self.system(numbers)
+            system = self.tree.tree(numbers)
             if name == "event":
                 assert system.event is not None
                 return system.event(t, y)
@@ -365,11 +361,8 @@ def _traits(form: Form) -> Traits:
             if own == "field" or ends[k]:
                 warn_of_unclear(_name(own.rstrip("s"), k), functools.partial(form.function(own, k), numbers), y)
 
-    def is_large(field: OfRun) -> bool:
-        program, _ = traced(spelled_out(field), numbers, t, y)
-        return sum(len(opened(inner)[0].eqns) for inner in programs_in(program)) > LARGE
-
-    modes = form.system([jnp.zeros((), kind.dtype) for kind in numbers]).modes
+    modes = form.tree.tree([jnp.zeros((), kind.dtype) for kind in numbers]).modes
+    fields = [traced(spelled_out(form.function("field", k)), numbers, t, y)[0] for k in range(form.modes)]
     depends_on_time = depends_on_first(combined([*step_functions, *reset_functions]), t, y, *numbers)
     if depends_on_time:
         jax.eval_shape(warned, numbers)
@@ -379,7 +372,7 @@ def _traits(form: Form) -> Traits:
         tuple(ends),
         tuple(resets),
         tuple(getattr(mode, "is_projected", False) for mode in modes),
-        tuple(is_large(form.function("field", k)) for k in range(form.modes)),
+        tuple(len(equations_in(field)) > LARGE for field in fields),
     )
 
 
@@ -521,7 +514,7 @@ def _check_functions(form: Form, prefix: str) -> None:
     }
 
     def called(method: str, numbers: Sequence[Array], *arguments: Array) -> PyTree:
-        mode: Any = form.system(numbers).modes[0]
+        mode: Any = form.tree.tree(numbers).modes[0]
         system = mode.formulation.system
         exit = exit_of(system.margin(*arguments), 0) if method == "reset" else ()
         return getattr(system, method)(*arguments, *exit)

@@ -381,6 +381,7 @@ def parts_of_system(system: AbstractSystem, q: Coordinates, rate: Coordinates) -
     return parts
 
 
+@np.errstate(all="ignore")
 def rooms(parts: Parts, xp: ModuleType) -> Parts:
     """The room that each rule leaves: name of a rule in `RULES` -> a number below zero, or NaN, where the start breaks it.
 

@@ -117,8 +117,7 @@ class OwnModel(AbstractModel):
         if is_traced(self):
             return
         parts = jax.tree.map(np.asarray, _compiled_parts(self))
-        with np.errstate(all="ignore"):
-            left = rooms(parts, np)
+        left = rooms(parts, np)
         system = self.parameters.tree["system"]
         for rule in RULES:
             if rule in left and not left[rule] >= 0.0:
@@ -138,9 +137,7 @@ class OwnModel(AbstractModel):
         return _all_left(rooms(_parts_of_cells(self), jnp))
 
     def legal_cells(self, columns: dict[str, Array]) -> Bool[Array, " cells"]:
-        parts = jax.tree.map(np.asarray, _compiled_parts(self.replaced(columns)))
-        with np.errstate(all="ignore"):
-            return _all_left(rooms(parts, np))
+        return _all_left(rooms(jax.tree.map(np.asarray, _compiled_parts(self.replaced(columns))), np))
 
     @property
     def smooth(self) -> bool:

@@ -18,7 +18,7 @@ from ...integration import AbstractProblem, LaneState, Settings, explicit_tablea
 from ...integration.problem import LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ...integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
 from ...integration.scheduler import LaneScheduler, back_to_margin, outcome_of, with_crossing_times
-from ...integration.step import Control, after_step, length_to_try, looks_of, past_jump, until_jump
+from ...integration.step import Control, after_step, length_to_try, looks_of
 from ..page import Page, page, script, template
 from ..stage import Stage
 from .javascript import javascript
@@ -147,26 +147,19 @@ def stepper_of(begin: Callable[..., LaneScheduler], examples: tuple[PyTree, ...]
     margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
     trial = Step(state, state, state, time, time, margins, (), state, None)
 
-    def after(constants: PyTree, lane: LaneState, length: Array, trial: Step) -> LaneState:
-        problem, control, atols = run(constants)
-        near = until_jump(problem, control, lane)
-        new_lane = after_step(problem, near, atols, lane, length, trial)
-        return past_jump(problem, control, near, lane, new_lane)
-
-    def length(constants: PyTree, lane: LaneState) -> Array:
-        problem, control, _ = run(constants)
-        return length_to_try(until_jump(problem, control, lane), lane)
-
     functions: Functions = {
         "begin": (lambda *inputs: eqx.filter(_started(begin, *inputs), eqx.is_array), examples),
-        "length": (length, (constants, lane)),
+        "length": (
+            lambda constants, lane: length_to_try(run(constants)[0], run(constants)[1], lane),
+            (constants, lane),
+        ),
         "field": (lambda constants, time, state: run(constants)[0].field(time, state), (constants, time, state)),
         "margins": (lambda constants, time, state: run(constants)[0].margins(time, state), (constants, time, state)),
         "crossing": (
             lambda constants, state, rate: run(constants)[0].crossing_along(state, rate),
             (constants, state, state),
         ),
-        "after": (after, (constants, lane, time, trial)),
+        "after": (lambda constants, *step: after_step(*run(constants), *step), (constants, lane, time, trial)),
     }
     facts = {
         "constants": size_of(constants),

@@ -153,7 +153,7 @@ def test_room_is_left_where_the_ball_fits_and_ends_at_the_curvature_of_the_ball(
 @pytest.mark.parametrize("name", ["cylinder", "sphere", "outside of a cylinder", "outside of a sphere"])
 def test_the_angle_counts_from_the_lowest_point(name):
     frame = frame_of(*SURFACES[name], DISTANCE, PULL)
-    radius = 0.3 - 0.02 if frame.inside else 0.32
+    radius = 0.3 - 0.02 if frame.side > 0.0 else 0.32
     for eta in (0.0, 0.7, -0.7, np.pi / 2.0, 2.0):
         place = frame.at_angle(jnp.asarray(eta))
         assert_close(frame.angle(*place), abs(eta) if "sphere" in name else eta, atol=1e-12)

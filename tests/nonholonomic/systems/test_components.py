@@ -155,8 +155,8 @@ def test_a_large_field_stands_once_in_a_program_and_its_motion_is_that_of_scipy(
         return problem.field(state[-1], state + once)
 
     text = jax.jit(twice).lower(problem.start()[0]).as_text()
-    assert text.count("func.func private @_rates") == 1
-    assert text.count("call @_rates") == 2
+    assert text.count("func.func private @_in_lanes") == 1
+    assert text.count("call @_in_lanes") == 2
     run = simulate(car, (q, rate), 2.0, times=[2.0])
     field = jax.jit(Lagrange(car).field)
     start = np.concatenate([q, rate])
