@@ -27,7 +27,7 @@ from nonholonomic.parameters import numbers
 from nonholonomic.runs.identify import AbstractEventTimes, Cells, Data, Prior, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel
 from nonholonomic.text import distinguishing_labels
-from nonholonomic.validation import as_number, as_number_or_none, is_traced, require_kind, require_scalars, warn
+from nonholonomic.validation import as_number_or_none, is_traced, require_kind, require_scalars, warn
 
 from .model.scene import Launch, Scene, as_launch
 from .runs.launches import angle_of, check_event, check_reversible, check_smooth, event_of, require_rigid
@@ -154,11 +154,7 @@ class AbstractTimes(AbstractEventTimes):
     """Measured times of an event of launches; see `InversionTimes`."""
 
     launch: Launch = eqx.field(converter=as_launch)
-    time: Float[Array, "launches *two"] = eqx.field(converter=as_number)
-    error: Float[Array, "..."] = eqx.field(converter=as_number)
-    t1: Float[Array, ""] = eqx.field(converter=as_number)
     until: Float[Array, "..."] | None = eqx.field(converter=as_number_or_none, default=None)
-    by_tables = True
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, " or a list of launches")

@@ -367,8 +367,8 @@ FORMER_WORDS = {"reached t1": "completed", "reached_end": "completed"}
 class Status(enum.IntEnum):
     """How a run ended: the words that all functions use, and the integers for transformations.
 
-    Runs and tables contain the word, such as "contact_lost"; runs inside `jit` and `vmap` contain the integer. (Files
-    have other integers, which the attribute `flag_meanings` explains.)
+    Runs and tables contain the word, such as "contact_lost"; runs inside `jit` and `vmap` contain the integer, and so
+    do files, whose attribute `flag_meanings` lists the words.
 
     - `COMPLETED`: the run reached its horizon `t1`. `INVERTED` and `NOT_INVERTED`: whether the top had turned over by then, in
       tables of inversion times, whose runs end at the inversion.

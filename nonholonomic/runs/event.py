@@ -21,7 +21,7 @@ from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, sol
 from ..hybrid import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid, solve_hybrid_with_tangents
 from ..hybrid.saltation import UNMEASURED, Clock
 from ..integration import AbstractProblem, ExtendedProblem, Lanes, Outcome, Settings, States, solve_ensemble
-from ..integration.problem import CROSSED, REACHED_END, RUNNING, AbstractDerivedProblem, Status, legal_run
+from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_run
 from ..parameters import Parameters
 from ..terminal import status_line
 from ..text import described, gathered, likely, name_of, shown
@@ -148,20 +148,24 @@ def with_clock(problem: AbstractProblem) -> ExtendedProblem:
     return ExtendedProblem(problem, Clock(), clock, clock + UNMEASURED)
 
 
-class EventProblem(AbstractDerivedProblem):
-    """A problem with a user's event in place of its own.
+class EventProblem(ExtendedProblem):
+    """A problem with a user's event in place of its own. The state ends with the time if the event depends on it.
 
     - `model`: the model with the event; `mode`, `index`: the mode of the problem and its index, or `None`.
-    - `clock`: the time [s] at the start, (1, cells), if the event depends on time; otherwise (0, cells).
     """
 
-    problem: AbstractProblem
-    model: AbstractModel
-    clock: Float[Array, "clocks *cells"]
-    mode: AbstractBatchedMode | None = None
-    index: int | None = eqx.field(static=True, default=None)
+    model: AbstractModel = eqx.field(kw_only=True)
+    mode: AbstractBatchedMode | None = eqx.field(kw_only=True, default=None)
+    index: int | None = eqx.field(kw_only=True, static=True, default=None)
 
     direction_decides: ClassVar[bool] = True
+    leading: ClassVar[None] = None
+
+    @classmethod
+    def of(cls, problem: AbstractProblem, clock: Float[Array, "clocks *cells"], **parts: Any) -> "EventProblem":
+        """The problem. **Arguments:** `clock`: the time [s] at the start, (1, cells), if the event depends on time; otherwise
+        (0, cells); `parts`: the other fields."""
+        return cls(problem, Clock(), clock, jnp.full_like(clock, UNMEASURED), **parts)
 
     @property
     def fits_one_kernel(self) -> bool:
@@ -170,18 +174,6 @@ class EventProblem(AbstractDerivedProblem):
     @property
     def fast(self) -> tuple[bool, bool]:
         return self.problem.fast[0], True
-
-    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
-        return state[:-1] if len(self.clock) else state
-
-    def start(self) -> tuple[States, States]:
-        states, scales = self.problem.start()
-        return jnp.concatenate([states, self.clock]), jnp.concatenate([scales, jnp.full_like(self.clock, UNMEASURED)])
-
-    def field(self, time: Lanes, state: States) -> States:
-        core = self.inner(state)
-        rates = self.problem.field(time, core)
-        return jnp.concatenate([rates, jnp.ones_like(state[len(core) :])]) if len(self.clock) else rates
 
     def event_function(self, state: States) -> Lanes:
         return value_in_lanes(self.model, self.mode, self.index, state)
@@ -226,7 +218,7 @@ class EventMode(AbstractBatchedMode):
     def problem(self, state: Float[Array, "components cells"]) -> EventProblem:
         core, clock = self._parts(state)
         mode = self.modes[self.index]
-        return EventProblem(mode.problem(core), self.model, clock, mode, self.index)
+        return EventProblem.of(mode.problem(core), clock, model=self.model, mode=mode, index=self.index)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         core, clock = self._parts(state)
@@ -263,7 +255,7 @@ def problem_of(model: AbstractModel, cells: int | None, names: Names) -> Abstrac
         return model.problem(cells, names)
     problem = model.problem(cells, None if names is None else (*dict.fromkeys((*names, *model.event.names)),))
     clock = jnp.zeros((int(model.event.depends_on_time), *problem.start()[0].shape[1:]))
-    return EventProblem(problem, model, clock)
+    return EventProblem.of(problem, clock, model=model)
 
 
 def modes_of(model: AbstractModel, cells: int, tolerance: Number, names: Names, continues: bool = False) -> Start:

@@ -101,15 +101,12 @@ class AbstractEventTimes(AbstractData):
     - `student`: degrees of freedom of Student's t distribution of the errors, or `None`.
     """
 
-    launch: eqx.AbstractVar[Any]
-    time: eqx.AbstractVar[Float[Array, "n *two"]]
-    error: eqx.AbstractVar[Float[Array, "..."]]
-    t1: eqx.AbstractVar[Float[Array, ""]]
+    launch: Any
+    time: Float[Array, "n *two"] = eqx.field(converter=as_number)
+    error: Float[Array, "..."] = eqx.field(converter=as_number)
+    t1: Float[Array, ""] = eqx.field(converter=as_number)
     until: eqx.AbstractVar[Float[Array, "..."] | None]
     student: eqx.AbstractVar[Float[Array, ""] | None]
-
-    #: Whether times through several modes come from the programs of tables, which is faster for flights in closed form.
-    by_tables: ClassVar[bool] = False
 
     def __check_init__(self):
         shape = np.shape(self.time)
@@ -222,10 +219,6 @@ class EventTimes(AbstractEventTimes):
     (('time 1', 'time 2', 'time 3'), [False, False, True])
     """
 
-    launch: Any
-    time: Float[Array, "n *two"] = eqx.field(converter=as_number)
-    error: Float[Array, "..."] = eqx.field(converter=as_number)
-    t1: Float[Array, ""] = eqx.field(converter=as_number)
     event: Callable[..., Any] | None = None
     input: Any = None
     until: Float[Array, "..."] | None = eqx.field(converter=as_number_or_none, default=None)
@@ -348,8 +341,7 @@ class DataModel(eqx.Module):
             sources = [self.data[k] for k in indices]
             predict = _predicted
             if self.on_host:
-                by_tables = getattr(sources[0].data, "by_tables", False)
-                predict = _predicted_by_tables if by_tables else _compiled
+                predict = _compiled if isinstance(sources[0].data, AbstractRecording) else _predicted_by_tables
             lanes = predict(sources, [values[k] for k in indices], rows, self.settings)
             of_runs = lanes.reshape(rows, -1, *lanes.shape[1:])
             firsts = np.cumsum([0, *(source.runs for source in sources)])

@@ -168,9 +168,6 @@ class AbstractModel(eqx.Module):
     #: The quantities of a state, by name.
     quantities: ClassVar[dict[str, Quantity]]
 
-    #: The words for how a run ends, in the order of the integers in files.
-    words: ClassVar[tuple[str, ...]]
-
     #: The variables of a table that describe the end of a run.
     ends: ClassVar[dict[str, Variable]]
 

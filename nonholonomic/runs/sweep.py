@@ -207,7 +207,7 @@ def sweep(
                 f"{name} = {shown(option)}: these are {name} of the time of an event, and without event= the runs are only "
                 "sampled; pass event=, or leave out times and quantities"
             )
-    return table_of(model, named, float(t1), crossing, options, TableForm(model.words), samples=samples, timed=timed)
+    return table_of(model, named, float(t1), crossing, options, TableForm(), samples=samples, timed=timed)
 
 
 def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Number | None) -> Samples | None:

@@ -18,6 +18,9 @@ from .event import SILENT, Ensemble, status_of
 from .model import AbstractModel, Number
 from .simulate import Samples, solve_samples
 
+#: The words for how a run ends, in the order of `Status`.
+WORDS = tuple(status.word for status in sorted(Status)[1:])
+
 #: Descriptions of the counters of every run.
 COUNTED = {"steps": "steps", "rejected": "rejected steps"}
 
@@ -25,16 +28,14 @@ COUNTED = {"steps": "steps", "rejected": "rejected steps"}
 class TableForm(NamedTuple):
     """The names in a table of a kind of model.
 
-    - `words`: the words for how a run ends, in the order of the integers in files; `named`: statuses with a word of their
-      own, by the word of `Status`.
+    - `named`: statuses in place of others.
     - `event`: what the event is, for descriptions of variables.
     - `run`: the word for a run in descriptions.
     - `time`: name of the variable of the event's time; `order`: the variables in order, by default as they come.
     - `nan_if_failed`: whether the time of a run without a result is NaN; otherwise it is infinite.
     """
 
-    words: tuple[str, ...]
-    named: dict[str, str] | None = None
+    named: dict[Status, Status] = {}  # noqa: RUF012
     event: str = "event"
     nan_if_failed: bool = True
     time: str = "time"
@@ -43,9 +44,8 @@ class TableForm(NamedTuple):
 
     @property
     def codes(self) -> np.ndarray:
-        """The integer of a file for each integer of `Status` from 0 on; -1 for statuses without a word."""
-        words = [(self.named or {}).get(status.word, status.word) for status in sorted(Status)[1:]]
-        return np.array([self.words.index(word) if word in self.words else -1 for word in words], np.int8)
+        """The integer in a table for each integer of `Status` from 0 on."""
+        return np.array([self.named.get(status, status) for status in sorted(Status)[1:]], np.int8)
 
 
 class TableJob(NamedTuple):
@@ -116,7 +116,7 @@ class TableJob(NamedTuple):
         """The variables that describe how a run ended."""
         counts = COUNTED | self.model.counters
         of_end = {
-            "status": Variable("1", np.int8, self.form.words, long_name=f"how the {self.form.run} ended"),
+            "status": Variable("1", np.int8, WORDS, long_name=f"how the {self.form.run} ended"),
             "end_time": Variable("s", np.float64, long_name=f"end of the {self.form.run}"),
         }
         return of_end | ends | {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}

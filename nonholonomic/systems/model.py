@@ -220,10 +220,6 @@ class OwnModel(AbstractModel):
         axes = tuple(0 if jnp.ndim(value) else None for value in values)
         return jax.vmap(of_one, in_axes=(1, *axes), out_axes=1)(rows, *values)
 
-    @property
-    def words(self) -> tuple[str, ...]:
-        return ("event", "completed", "stopped", "failed", "unresolved", "illegal")
-
     def ended(self, outcome: Outcome | HybridOutcome, tolerance: object) -> Int[Array, " cells"]:
         return statuses(outcome.status, Status.STOPPED)
 

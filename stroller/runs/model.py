@@ -89,7 +89,6 @@ class RideModel(AbstractSceneModel):
     smooth, continues = True, True
     # Nothing is watched.
     comparable = ("speed",)
-    words = ("completed", "contact_lost", "rank_lost", "failed", "event")
     quantities, ends = QUANTITIES, ENDS
 
     @classmethod

@@ -260,10 +260,7 @@ class Steps(NamedTuple):
 
     def _between(self, spec: RideSpec, step: Int[np.ndarray, " lanes"], length: Lanes) -> States:
         """The states at given times [s] after the starts of some steps."""
-
-        def field(times: Lanes, states: States) -> States:
-            return in_blocks(lambda *arguments: _field(spec, *arguments), times, states)
-
+        field = functools.partial(in_blocks, _field, spec)
         time, start, solver = self.times[step], self.states[:, step], spec.ride.settings.for_steps_alone
         rates = [field(time, start)]
         if not isinstance(solver, diffrax.AbstractERK):
@@ -286,13 +283,14 @@ def _field(spec: RideSpec, times: Float[Array, "*lanes"], states: State) -> Stat
     return model.scene.dynamics.field(times, states, model.input)
 
 
-def in_blocks(function: Callable[..., Array], *columns: np.ndarray) -> np.ndarray:
-    """A compiled function of any number of columns, `WIDTH` at a time; the last block is padded with its last column."""
+def in_blocks(function: Callable[..., Array], spec: RideSpec, *columns: np.ndarray) -> np.ndarray:
+    """A compiled function of a ride and any number of columns, `WIDTH` at a time; the last block is padded with its last
+    column."""
     count = columns[0].shape[-1]
     results = []
     for first in range(0, count, WIDTH):
         lanes = np.minimum(np.arange(first, first + WIDTH), count - 1)
-        results.append(np.asarray(function(*(column[..., lanes] for column in columns))))
+        results.append(np.asarray(function(spec, *(column[..., lanes] for column in columns))))
     return np.concatenate(results, axis=-1)[..., :count]
 
 
@@ -304,7 +302,7 @@ def followed(spec: RideSpec) -> tuple[Steps, Stats]:
         path = follow(problem, float(t1), settings, dense=False)
         steps, counts = Steps(path.times, path.states), (path.accepted, path.rejected, not path.failed)
     else:
-        solution, ends = _on_grid(problem, spec), np.asarray(grid)
+        solution, ends = _sample(problem, None, t1, settings, grid=grid), np.asarray(grid)
         mask = ends <= float(solution.end_time)
         steps = Steps(ends[mask], np.asarray(solution.states)[:, mask])
         counts = (int(solution.accepted), int(solution.rejected), bool(mask.all()))
@@ -317,11 +315,7 @@ def _problem(model: Any) -> RideProblem:
     return model.problem(None, None)
 
 
-@compiled_quickly
-def _on_grid(problem: RideProblem, spec: RideSpec) -> Any:
-    """A ride with given steps, sampled at their ends."""
-    _, t1, settings, grid = spec.ride
-    return sample(problem, None, t1, settings, grid=grid)
+_sample = compiled_quickly(sample)
 
 
 #: Quantities that can be watched: the normal force [N], the cosine of the steering angle, and the relative reduced
@@ -331,7 +325,7 @@ WATCHED = ("normal_force", "steering_cosine", "rank")
 
 def watched(spec: RideSpec, states: States, name: str) -> Lanes:
     """A quantity in `WATCHED` at the given states."""
-    return in_blocks(lambda state: _watched(spec, state), states)[WATCHED.index(name)]
+    return in_blocks(_watched, spec, states)[WATCHED.index(name)]
 
 
 @eqx.filter_jit

@@ -19,7 +19,7 @@ from nonholonomic.identification import (
     as_quantity,
     read_columns,
 )
-from nonholonomic.integration.problem import DEFAULT_MAX_STEPS
+from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status
 from nonholonomic.parameters import full_axes
 from nonholonomic.runs.identify import Data, Prior, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel
@@ -40,8 +40,7 @@ from .trajectory import Trajectory, ride
 
 #: The names in a table of rides. A ride continues if contact is lost, as if the ground could pull.
 FORM = TableForm(
-    words=("completed", "contact_lost", "rank_lost", "failed"),
-    named={"event": "contact_lost"},
+    named={Status.EVENT: Status.CONTACT_LOST},
     event="loss of contact",
     nan_if_failed=False,
     time="contact_time",

@@ -8,10 +8,10 @@ import xarray
 import nonholonomic
 import stroller
 import tippe
+from nonholonomic.runs.table import WORDS, TableForm
 from nonholonomic.sweeps import Table, Variable, axis, sweep
 from stroller.runs.verbs import FORM
 from tippe.runs.model import INVERSIONS, REVERSALS
-from tippe.runs.verbs import TRAJECTORIES as OF_TRAJECTORIES
 
 pytestmark = pytest.mark.oldest
 
@@ -52,15 +52,13 @@ def test_words_of_earlier_versions_are_understood_and_others_refused():
 
 
 def test_all_tables_use_words_of_the_list():
-    words_of_list = {status.word for status in Status}
-    for words in (FORM.words, OF_TRAJECTORIES.words, INVERSIONS.words, REVERSALS.words):
-        assert words_of_list.issuperset(words)
-        assert len(set(words)) == len(words)
-    # Each file states the meanings of its integers; these integers are the oldest.
-    words = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
-    assert words == INVERSIONS.words
-    assert OF_TRAJECTORIES.words[:4] == ("completed", "contact_lost", "failed", "jammed")
-    assert FORM.words == ("completed", "contact_lost", "rank_lost", "failed")
+    assert tuple(Status(code).word for code in range(len(WORDS))) == WORDS
+    kept = {status: status for status in Status if status is not Status.PENDING}
+    for form in (TableForm(), FORM, INVERSIONS, REVERSALS):
+        assert {Status(k): Status(code) for k, code in enumerate(form.codes)} == kept | form.named
+    assert INVERSIONS.named == {Status.EVENT: Status.INVERTED, Status.COMPLETED: Status.NOT_INVERTED}
+    assert REVERSALS.named == {Status.EVENT: Status.REVERSED, Status.COMPLETED: Status.NOT_REVERSED}
+    assert FORM.named == {Status.EVENT: Status.CONTACT_LOST}
 
 
 def swept(words, path, fails_at=np.inf):
@@ -86,7 +84,7 @@ def test_a_file_with_the_words_of_earlier_versions_is_read_with_those_of_today(t
     assert table.words["status"][0] == "completed"
     assert table.to_xarray()["status"].values[0] == "completed"
     # The same call finds all of it done.
-    assert swept(OF_TRAJECTORIES.words, tmp_path / "old.h5", fails_at=0).status.tolist() == table.status.tolist()
+    assert swept(WORDS, tmp_path / "old.h5", fails_at=0).status.tolist() == table.status.tolist()
     table.save(tmp_path / "new.h5")
     with xarray.open_dataset(tmp_path / "new.h5", engine="h5netcdf") as dataset:
         assert dataset["status"].attrs["flag_meanings"].split()[0] == "completed"
@@ -97,5 +95,5 @@ def test_a_sweep_that_was_begun_with_the_former_words_goes_on_with_all_of_today(
         swept(FORMER, tmp_path / "old.h5", fails_at=8)
     part = Table.load(tmp_path / "old.h5")
     assert set(part.status) <= {"completed", "contact_lost", "failed", "jammed", "pending"}
-    table = swept(OF_TRAJECTORIES.words, tmp_path / "old.h5")
-    assert table.status.tolist() == [*2 * OF_TRAJECTORIES.words[:4], "completed", *3 * ["does_not_fit"]]
+    table = swept(WORDS, tmp_path / "old.h5")
+    assert table.status.tolist() == [*2 * WORDS[:4], "completed", *3 * ["does_not_fit"]]

@@ -18,7 +18,7 @@ import tippe
 from nonholonomic.compilation.xla_cpu import compile_quickly
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
-from nonholonomic.runs.table import TableJob, errors_of, second_tolerance
+from nonholonomic.runs.table import WORDS, TableJob, errors_of, second_tolerance
 from tippe.runs.model import INVERSIONS, TopModel
 
 ANGLE, TOLERANCE = 0.95 * np.pi, 1e-9
@@ -48,8 +48,8 @@ def table_of(scenes: Batch, count: int, t1: float) -> dict[str, np.ndarray]:
         TableJob(model, INVERSIONS, t1, "first", Settings(tolerance))(scenes.columns, count)
         for tolerance in (TOLERANCE, second_tolerance(TOLERANCE))
     )
-    silent = tuple(INVERSIONS.words.index(word) for word in ("failed", "unresolved"))
-    words = np.array(INVERSIONS.words)[first["status"]]
+    silent = tuple(int(tippe.Status.of(word)) for word in ("failed", "unresolved"))
+    words = np.array(WORDS)[first["status"]]
     bounds = errors_of(first, second, ("time", "end_time", "end_theta"), tuple(model.counters), silent)
     return first | bounds | {"word": words}
 

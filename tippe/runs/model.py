@@ -101,16 +101,12 @@ def why_unresolved(smooth: bool) -> str:
 
 # The top as a model.
 
-#: The words of tables, in the order of the integers in their files, which is older than `Status`.
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
-
 #: The names in tables of inversion times and of reversal times.
-INVERSIONS = TableForm(WORDS, {"event": "inverted", "completed": "not_inverted"}, "inversion", nan_if_failed=False)
+INVERSIONS = TableForm(
+    {Status.EVENT: Status.INVERTED, Status.COMPLETED: Status.NOT_INVERTED}, "inversion", nan_if_failed=False
+)
 REVERSALS = TableForm(
-    ("reversed", "not_reversed", *WORDS[2:]),
-    {"event": "reversed", "completed": "not_reversed"},
-    "reversal",
-    nan_if_failed=False,
+    {Status.EVENT: Status.REVERSED, Status.COMPLETED: Status.NOT_REVERSED}, "reversal", nan_if_failed=False
 )
 
 #: The numbers of a run's end.
@@ -135,7 +131,6 @@ class TopModel(AbstractSceneModel):
 
     components = COMPONENTS
     comparable = ("direction",)
-    words = ("event", "completed", *WORDS[2:])
     ends = ENDS
 
     @classmethod

@@ -54,9 +54,6 @@ from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
 # Tables of many launches: inversion times, reversal times, and trajectories.
 
-#: The words for how the run of a trajectory ends, in the order of `Status`.
-TRAJECTORIES = TableForm(tuple(Status(code).word for code in range(Status.UNRESOLVED + 1)))
-
 
 def too_many_steps(t1: float, max_steps: int, end: float) -> str:
     """Message for a run that needs more than the allowed steps."""
@@ -371,7 +368,7 @@ def trajectory_table(
     roots, grid = launches(scene, launch_values, axes, t1, tolerance, taken=QUANTITIES)
     model = TopModel(scene=roots["scene"], launch=roots["launch"])
     check_cells(model, grid, options)
-    job = TableJob(model, TRAJECTORIES, float(t1), "first", settings, samples=samples, timed=False)
+    job = TableJob(model, TableForm(), float(t1), "first", settings, samples=samples, timed=False)
     return compute_table(job, grid, {}, options)
 
 
@@ -546,7 +543,7 @@ def first_or_last_time(model: TopModel, t1: Number, crossing: str, settings: Set
     # Repeat the run to find the cause.
     t1, form = float(t1), REVERSALS if model.reverses else INVERSIONS
     cell = {name: values[0] for name, values in TableJob(model, form, t1, crossing, settings)({}, 1).items()}
-    word = form.words[cell["status"]]
+    word = Status(cell["status"]).word
     if word == "failed" and cell["steps"] >= settings.max_steps:
         raise ValueError(too_many_steps(t1, settings.max_steps, cell["end_time"]))
     reason = f": {why_unresolved(model.smooth)}" if word == "unresolved" else ""

@@ -60,7 +60,7 @@ def test_a_table_of_bounces_and_its_derivatives(table):
 
 def test_a_job_may_be_sent_to_another_process():
     model = model_of(BALL, jnp.array([1.0, 0.0, 0.0]))
-    job = TableJob(model, TableForm(model.words), 1.4, "first", Settings(1e-9))
+    job = TableJob(model, TableForm(), 1.4, "first", Settings(1e-9))
     copy = pickle.loads(pickle.dumps(job)).model.parameters
     assert copy.names == model.parameters.names
     assert_close(copy.values, model.parameters.values)
