@@ -305,9 +305,17 @@ def sampled_if_legal(
     settings: Settings,
     grid: Float[Array, " steps"] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
-) -> tuple[Bool[Array, ""], SampledRows, Settings]:
-    """Whether all numbers, which may be traced, are legal; the run with the rows for all quantities, of zero length if the
-    numbers are not legal, unless there is a `grid`; and its settings. **Arguments:** as for `sampled`."""
+    were_checked: bool = False,
+) -> tuple[Bool[Array, ""], Int[Array, ""], SampledRows]:
+    """Whether all numbers, which may be traced, are legal; how the run ended, as an integer of `Status`; and the run with the
+    rows for all quantities, of zero length if the numbers are not legal, unless there is a `grid`.
+
+    **Arguments:** `were_checked`: whether the numbers were checked, so that the program need not contain the rules; the others
+    as for `sampled`.
+    """
+    if were_checked:
+        run = sampled(model, None, times, t1, settings, grid, adjoint)
+        return jnp.asarray(True), model.ended(run.outcome, settings.tolerance)[0], run
     is_legal, horizon, tolerance = legal_run(model.legal(), t1, settings.tolerance, times)
     if grid is None:
         t1, times = horizon, jnp.where(is_legal, times, 0.0)
@@ -320,8 +328,9 @@ def sampled_if_legal(
     numbers = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
     changes = [jnp.where(jnp.isfinite(leaf), leaf - jax.lax.stop_gradient(leaf), 0.0) for leaf in numbers]
     change = jnp.where(is_legal, 0.0, jnp.nan) * sum(map(jnp.sum, changes))
+    status = jnp.where(is_legal, model.ended(run.outcome, tolerance)[0], int(Status.ILLEGAL))
     # Selected, so that what is not a number in the cotangents of a legal run does not reach the sum.
-    return is_legal, dataclasses.replace(run, rows=jnp.where(is_legal, run.rows, run.rows + change)), settings
+    return is_legal, status, dataclasses.replace(run, rows=jnp.where(is_legal, run.rows, run.rows + change))
 
 
 def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> AbstractProblem:
@@ -335,15 +344,9 @@ def _run_and_extremes(
 ) -> tuple[Trajectory, Float[Array, "3"]]:
     """The run, or NaN and "illegal" if a traced number is out of range; and the extremes of its steps, as in
     `integration.Outcome`. **Arguments:** `unchecked`: whether a number is traced."""
-    if unchecked:
-        is_legal, samples, legal_settings = sampled_if_legal(model, times, t1, settings)
-    else:
-        # Already checked, so the program need not contain the rules.
-        is_legal, samples, legal_settings = jnp.asarray(True), sampled(model, None, times, t1, settings), settings
-    outcome = samples.outcome
-    names = tuple(model.quantities)
+    is_legal, status, samples = sampled_if_legal(model, times, t1, settings, were_checked=not unchecked)
+    outcome, names = samples.outcome, tuple(model.quantities)
     values = model.read(names, times, nan_unless(is_legal, samples.rows), samples.mode)
-    status = model.ended(outcome, legal_settings.tolerance)[0]
     is_reached = is_legal & jnp.all(jnp.isfinite(samples.rows), axis=0)
     mode = jnp.where(is_reached, 0 if samples.mode is None else samples.mode, -1)
     run = Trajectory(
@@ -354,7 +357,7 @@ def _run_and_extremes(
         switches=sum((count[0] for count in outcome.counts), jnp.zeros((), int)),
         steps=outcome.steps[0],
         rejected=outcome.rejected[0],
-        code=jnp.where(is_legal, status, int(Status.ILLEGAL)),
+        code=status,
         model=model,
         t1=t1,
         settings=settings,

@@ -452,25 +452,23 @@ class Trajectory(AbstractRun):
         """
         require_outside((self.t, times), "at", "times= of simulate")
         require_one_run(self, "at", "")
-        run = self.with_steps()
-        assert run.steps is not None
-        times = times_within(times, run.steps.times[-1], "ride")
-        read = read_off_compiled(self.spec, times, run.steps.at(self.spec, times), self.stats)
-        return dataclasses.replace(read, steps=run.steps)
+        steps = self._all_steps
+        times = times_within(times, steps.times[-1], "ride")
+        read = read_off_compiled(self.spec, times, steps.at(self.spec, times), self.stats)
+        return dataclasses.replace(read, steps=steps)
 
-    def with_steps(self) -> "Trajectory":
-        """The same run with its steps."""
-        return self if self.steps is not None else dataclasses.replace(self, steps=followed(self.spec)[0])
+    @functools.cached_property
+    def _all_steps(self) -> Steps:
+        """The ends of the steps; a run inside a transformation is repeated for them."""
+        return followed(self.spec)[0] if self.steps is None else self.steps
 
     @property
     def contact_lost_at(self) -> float:
         """Time [s] at which the ground first has to pull on the stroller to keep contact; infinite if there is no such
         time."""
-        run = self.with_steps()
-        assert run.steps is not None
-        force = watched(run.spec, run.steps.states, "normal_force")
+        force = watched(self.spec, self._all_steps.states, "normal_force")
         allowed = -CONTACT_ROUND_OFF * np.max(np.abs(force[np.isfinite(force)]), initial=0.0)
-        return run._first_below("normal_force", allowed)
+        return self._first_below("normal_force", allowed)
 
     @property
     def rank_lost_at(self) -> float:
@@ -484,8 +482,7 @@ class Trajectory(AbstractRun):
 
     def _crossings(self, name: str, level: float) -> tuple[float, Float[np.ndarray, " times"]]:
         """A watched quantity less a level at the start, and the times [s] at which it passes this level."""
-        steps = self.with_steps().steps
-        assert steps is not None
+        steps = self._all_steps
         value = watched(self.spec, steps.states, name) - level
         times = all_crossings(
             lambda times: watched(self.spec, steps.at(self.spec, times), name) - level, steps.times, value
@@ -511,10 +508,9 @@ class Trajectory(AbstractRun):
         if not (bool(self.stats.finished) and np.all(np.isfinite(self.state))):
             is_legal = self.model.legal()
             return "failed" if np.all(is_legal) else "illegal"
-        run = self.with_steps()
-        if np.isfinite(run.rank_lost_at):
+        if np.isfinite(self.rank_lost_at):
             return "rank_lost"
-        return "contact_lost" if np.isfinite(run.contact_lost_at) else "completed"
+        return "contact_lost" if np.isfinite(self.contact_lost_at) else "completed"
 
     def table_of(self, names: Sequence[str]) -> Table:
         require_one_run(self, "to_table", "; stroller.sweep makes a table of many")
@@ -524,7 +520,6 @@ class Trajectory(AbstractRun):
         return names_of(runs, unit) if len(runs) > 1 else [""]
 
     def in_words(self) -> str:
-        self = self.with_steps()
         jackknives = self.jackknifed_at
         lines = [
             f"Trajectory of {self.t.size} times, {float(self.t[0]):g} s to {float(self.t[-1]):g} s: {self.status}",
@@ -613,7 +608,7 @@ def ride(
 def _sampled(spec: RideSpec, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run at `times`; NaN and `finished` false if a traced number is out of range."""
     model, t1, settings, grid = spec.ride
-    is_legal, samples, _ = sampled_if_legal(model, times, t1, settings, grid, adjoint)
+    is_legal, _, samples = sampled_if_legal(model, times, t1, settings, grid, adjoint)
     outcome = samples.outcome
     rejected = outcome.rejected[0].astype(int)
     accepted = (outcome.steps[0] - outcome.rejected[0]).astype(int)

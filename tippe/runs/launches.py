@@ -240,14 +240,17 @@ def launches(
     # A launch with entries for all given numbers.
     sizes = {name: len(parts) for name, parts in SEVERAL.items()}
     sizes["place"] = 3 if "launch.place[2]" in values else len(scene.surface.coordinates)
+    parts = {name: [f"launch.{name}[{k}]" for k in range(size)] for name, size in sizes.items()}
     vectors = {
-        name: (0.0,) * size for name, size in sizes.items() if any(f"launch.{name}[{k}]" in values for k in range(size))
+        name: tuple(scalars.get(part, 0.0) for part in own) for name, own in parts.items() if set(own) & set(values)
     }
-    launch = Launch(theta=0.0, spin=0.0, **vectors)
+    angles = {name: scalars.get(f"launch.{name}", 0.0) for name in ("theta", "spin", "eta", "azimuth")}
+    launch = Launch(**angles, **vectors)
     names = labels(scene, launch, values, taken)
     listed = [(number, *names[number]) for number in values if number not in scalars]
     grid = [axis(name, number, unit, values[number], long_name) for number, name, unit, long_name in listed]
-    roots = with_numbers({"scene": scene, "launch": launch}, scalars)
+    of_scene = {number: value for number, value in scalars.items() if not number.startswith("launch.")}
+    roots = with_numbers({"scene": scene}, of_scene) | {"launch": launch}
     # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
     require_run(roots["scene"], roots["launch"], t1, tolerance, (Scene, Launch), LISTS)
     return roots, grid

@@ -496,9 +496,8 @@ def _traced(
             name = "contact = 'hybrid'" if scene.contact == "hybrid" else "SetValuedCoulomb"
             raise ValueError(f"adjoint = {adjoint!r} must be omitted for {name}")
         explicit_tableau(settings.for_lanes)
-    is_legal, run, settings = sampled_if_legal(model, times, t1, settings, adjoint=adjoint)
+    is_legal, status, run = sampled_if_legal(model, times, t1, settings, adjoint=adjoint)
     outcome = run.outcome
-    status = jnp.where(is_legal, model.ended(outcome, settings.tolerance)[0], int(Status.ILLEGAL))
     rejected, start = outcome.rejected[0], scene.state(model.launch)
     stats = {"accepted": outcome.steps[0] - rejected, "rejected": rejected}
     stats |= {name: count[0] for name, count in zip(model.counters, outcome.counts, strict=True)}
