@@ -36,13 +36,13 @@ from .planning.problem import Footprint as Footprint
 from .planning.problem import Goal as Goal
 from .planning.problem import Limits as Limits
 from .planning.result import Plan as Plan
+from .runs.model import Recording as Recording
+from .runs.model import identify as identify
+from .runs.model import log_density as log_density
+from .runs.model import read_recording as read_recording
+from .runs.model import simulate as simulate
+from .runs.model import sweep as sweep
 from .runs.trajectory import Trajectory as Trajectory
-from .runs.verbs import Recording as Recording
-from .runs.verbs import identify as identify
-from .runs.verbs import log_density as log_density
-from .runs.verbs import read_recording as read_recording
-from .runs.verbs import simulate as simulate
-from .runs.verbs import sweep as sweep
 from .runs.view import explore as explore
 
 # `import *` exports the names above, and not the subpackages.

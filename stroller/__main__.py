@@ -27,8 +27,8 @@ from .model.vehicle import Damping, Launch, Stroller
 from .planning.plan import plan
 from .planning.problem import Box, Goal, Limits
 from .planning.result import Plan, planned_stage
+from .runs.model import simulate
 from .runs.trajectory import Trajectory, table_of
-from .runs.verbs import simulate
 from .runs.view import draw_rides, grouped
 
 RIDES = ("without friction", "with friction")

@@ -19,8 +19,8 @@ from nonholonomic.views.plot import new_figure
 from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
 from ..model.dynamics import Dynamics, padded
+from ..runs.model import simulate
 from ..runs.trajectory import Trajectory
-from ..runs.verbs import simulate
 from .problem import Box, Disc, Footprint, Limits, Points, Problem, seen_from_above
 from .transcription import Drive
 

@@ -10,7 +10,7 @@ import stroller
 import tippe
 from nonholonomic.runs.table import WORDS, TableForm
 from nonholonomic.sweeps import Table, Variable, axis, sweep
-from stroller.runs.verbs import FORM
+from stroller.runs.model import FORM
 from tippe.runs.model import INVERSIONS, REVERSALS
 
 pytestmark = pytest.mark.oldest
