@@ -149,14 +149,14 @@ PAGES = {
                 "nonholonomic.hybrid",
                 "AbstractBatchedMode AbstractHoppingMode Transition TransitionPath solve_hybrid "
                 "HybridOutcome solve_hybrid_with_tangents solve_hybrid_dense HybridPath "
-                "Segment hybrid_resets solve_hybrid_with_samples hybrid_samples HybridSamples",
+                "Segment hybrid_resets solve_hybrid_with_samples hybrid_samples",
             ),
             "nonholonomic.derivatives",
             *of(
                 "nonholonomic.derivatives",
                 "solve_ensemble_with_tangents tangents_of tangent_scale in_groups "
                 "VariationalProblem AbstractDifferentiableSolve differentiable_solve tangents_by sampled_run "
-                "sampled_run_by_diffrax SampledRun growth exponent_of",
+                "SampledRun growth exponent_of",
             ),
             "nonholonomic.sweeps",
             *of(

@@ -46,7 +46,6 @@ from .differentiable import AbstractDifferentiableSolve as AbstractDifferentiabl
 from .differentiable import differentiable_solve as differentiable_solve
 from .sampled_runs import SampledRun as SampledRun
 from .sampled_runs import sampled_run as sampled_run
-from .sampled_runs import sampled_run_by_diffrax as sampled_run_by_diffrax
 from .variation import VariationalProblem as VariationalProblem
 from .variation import exponent_of as exponent_of
 from .variation import growth as growth

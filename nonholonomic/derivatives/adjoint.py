@@ -1,7 +1,8 @@
-"""First derivatives of event times with respect to any number of parameters: the discrete adjoint of an ensemble solve.
+"""First derivatives of event times, or of sums over samples, with respect to any number of parameters: the discrete adjoint
+of an ensemble solve.
 
 A run is cut into periods, and the steps of each period are recorded. After the last period, a backward pass carries the
-derivatives of the event times with respect to the states from the last period to the first. The records of the latest
+derivatives with respect to the states from the last period to the first. The records of the latest
 periods are kept; a period whose record is gone is computed again from the latest checkpoint before it. The cost does not
 depend on the number of parameters, and the memory does not depend on the length of the runs. Step lengths are held
 fixed, as in `variation.py`.
@@ -10,7 +11,7 @@ fixed, as in `variation.py`.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -22,11 +23,22 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, uncounted, written_by_component, written_in_place
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
-from ..integration.problem import CROSSED, REACHED_END, RUNNING, time_at_jump
-from ..integration.runge_kutta import Stages, moved_state, over_stages
+from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, time_at_jump
+from ..integration.runge_kutta import Integers, Stages, inner_stages, moved_state, over_stages
+from ..integration.samples import Record, SampleTimes, components, recorded_step
 from ..integration.scheduler import InLanes, LaneScheduler, Recorder, SchedulerState, outcome_of, with_crossing_times
-from ..integration.step import length_to_try, try_step
-from .variation import RunOptions, Tangent, Tangents, VariationalProblem, in_groups, moving_leaves, slopes_by_variations
+from .variation import (
+    RunOptions,
+    Tangent,
+    Tangents,
+    VariationalProblem,
+    in_groups,
+    moving_leaves,
+    slopes_by_variations,
+    tangent_scale,
+    tangents_of,
+    where_active,
+)
 
 # The periods of an ensemble solve that are kept for its adjoint: where some of them begin and end, and the steps of the
 # latest ones.
@@ -114,14 +126,15 @@ class LatestSteps(NamedTuple):
         return cls(jnp.zeros((), int), room)
 
     def added(self, first: Int[Array, ""], steps: StepRecord) -> "LatestSteps":
-        """Add the steps of a period that begins with iteration number `first`."""
+        """Add the steps of a period that begins with iteration number `first`; where an earlier period is computed again,
+        the steps after it are gone."""
         period = len(steps.length)
         size = len(self.ring.length) - period
 
         def written(stack: Array, rows: Array) -> Array:
             return jax.lax.dynamic_update_slice_in_dim(stack, rows, first % size, 0)
 
-        oldest = jnp.maximum(self.first, first + period - size)
+        oldest = jnp.maximum(jnp.minimum(self.first, first), first + period - size)
         return LatestSteps(oldest, jax.tree.map(written, self.ring, steps))
 
     def of_period(self, first: Int[Array, ""], period: int) -> StepRecord:
@@ -135,45 +148,154 @@ def read(stack: Array, index: Int[Array, ""]) -> Array:
     return jax.lax.dynamic_index_in_dim(stack, index, 0, keepdims=False)
 
 
-#: A tree of booleans like a problem: the leaves with respect to which to differentiate.
-Moving: TypeAlias = PyTree
+class Passes(NamedTuple):
+    """State of a forward pass, which computes the parts of runs, and of a backward pass, which carries derivatives through
+    them. The parts are periods of lanes, or rounds of modes.
+
+    `frontier` holds the runs at the start of the next part to compute, and `number` its number; the backward pass takes
+    the part before number `limit` next. A checkpoint is a tuple that begins with the runs at the start of a part. `other` is
+    what else the forward pass computes, and `adjoint` what the backward pass carries.
+    """
+
+    frontier: PyTree
+    number: Int[Array, ""]
+    limit: Int[Array, ""]
+    checkpoints: Checkpoints
+    other: PyTree
+    adjoint: PyTree
+
+
+#: (number of a part, runs at its start, what else is computed) -> the runs after it, its checkpoint, what else is computed.
+Forward: TypeAlias = Callable[[Int[Array, ""], PyTree, PyTree], tuple[PyTree, Period, PyTree]]
+
+#: (number of a part, its checkpoint, what else has been computed, derivatives at the end of the part) -> those at its start.
+Backward: TypeAlias = Callable[[Int[Array, ""], Period, PyTree, PyTree], PyTree]
+
+
+def there_and_back(
+    start: tuple[PyTree, Period, PyTree, PyTree],
+    most: int | Int[Array, ""],
+    is_running: Callable[[PyTree], Bool[Array, ""]],
+    is_kept: Callable[[Period, PyTree], Bool[Array, ""]],
+    forward: Forward,
+    backward: Backward,
+) -> Passes:
+    """Compute all parts of runs, and carry derivatives from the last part to the first. A part without a checkpoint is
+    computed again from the latest checkpoint before it.
+
+    **Arguments:**
+
+    - `start`: the runs before the first part, an example of a checkpoint, what else is computed, and the derivatives
+      after the last part.
+    - `most`: the greatest number of parts.
+    - `is_running`: whether there is another part.
+    - `is_kept`: whether all that `backward` needs of a part with a checkpoint is still kept.
+    - `forward`, `backward`: compute a part, and carry the derivatives through it.
+    """
+    frontier, example, other, adjoint = start
+
+    def is_ahead(run: Passes) -> Bool[Array, ""]:
+        return uncounted(is_running(run.frontier) & (run.number < run.limit), run.number)
+
+    def computed(run: Passes) -> Passes:
+        frontier, part, other = forward(run.number, run.frontier, run.other)
+        checkpoints = run.checkpoints.added(run.number, part)
+        return Passes(frontier, run.number + 1, run.limit, checkpoints, other, run.adjoint)
+
+    def is_next(run: Passes) -> Bool[Array, ""]:
+        number, part, _ = run.checkpoints.latest()
+        is_next = (run.checkpoints.depth > 0) & (number == run.limit - 1)
+        return uncounted(is_next & is_kept(part, run.other), run.number)
+
+    def taken_back(run: Passes) -> Passes:
+        number, part, checkpoints = run.checkpoints.latest()
+        adjoint = backward(number, part, run.other, run.adjoint)
+        return run._replace(limit=number, checkpoints=checkpoints, adjoint=adjoint)
+
+    def once(run: Passes) -> Passes:
+        run = jax.lax.while_loop(is_ahead, computed, run)
+        run = run._replace(limit=jnp.minimum(run.limit, run.number))
+        run = jax.lax.while_loop(is_next, taken_back, run)
+        number, (frontier, *_), checkpoints = run.checkpoints.latest()
+        return run._replace(frontier=frontier, number=number, checkpoints=checkpoints)
+
+    zero = jnp.zeros((), int)
+    run = Passes(frontier, zero, jnp.asarray(most), Checkpoints.none(example), other, adjoint)
+    return jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.number), once, run)
+
+
+class SampledCotangents(NamedTuple):
+    """The cotangents of the samples, of the time at which a run leaves the domain, and of the state at the horizon."""
+
+    states: Float[Array, "cells times components"]
+    end_time: Float[Array, " cells"]
+    end_state: Float[Array, "components cells"]
 
 
 class StepRecorder(Recorder):
-    """Records where each step began, and its length; what is differentiated is the time of the event at the end."""
+    """Records where each step began, and its length. The time of the event at the end of a run is differentiated; or, with
+    samples, a sum over the samples and the end: steps then end on the samples, where their cotangents enter.
+    """
+
+    times: SampleTimes | None = None
+    cotangents: SampledCotangents | None = None
 
     # As many iterations as fit in the caches with their record; a period ends with a refill.
     period: ClassVar[int] = 128
     refill_cost = 2.0
 
-    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> StepRecord:
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> Record:
         leaves = (lane_state.time, without_probe(lane_state).state, lane_state.length)
-        return StepRecord(*(jnp.zeros((self.period, *leaf.shape), leaf.dtype) for leaf in leaves))
+        steps = StepRecord(*(jnp.zeros((self.period, *leaf.shape), leaf.dtype) for leaf in leaves))
+        accepted, sample = jnp.ones_like(lane_state.bracketing), jnp.zeros_like(lane_state.steps)
+        if self.times is not None:
+            sample = self.times.after(lane_state.time, lane_state)
+            samples, fixed = jnp.zeros(steps.length.shape, sample.dtype), jnp.zeros(steps.state.shape, bool)
+            steps = steps._replace(sample=samples, fixed=fixed)
+        return Record(accepted, sample, steps)
 
     def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: StepRecord, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, StepRecord]:
-        next_state = try_step(*in_lanes, lane_state)
-        length = jnp.where(next_state.time > lane_state.time, length_to_try(*in_lanes[:2], lane_state), 0.0)
-        entry = StepRecord(lane_state.time, without_probe(lane_state).state, length)
-        return next_state, jax.tree.map(functools.partial(written_in_place, at=iteration), record, entry)
+        self, in_lanes: InLanes, lane_state: LaneState, record: Record, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, Record]:
+        state = without_probe(lane_state).state
 
-    def steps(self, record: Any) -> StepRecord:
-        """The steps in the record of a period."""
-        return record
+        def entry(new_lanes: LaneState, length: Lanes, sample: Integers | None) -> StepRecord:
+            fixed = None if sample is None else new_lanes.state[len(state) :] == 0.0
+            length = jnp.where(new_lanes.time > lane_state.time, length, 0.0)
+            return StepRecord(lane_state.time, state, length, sample, fixed)
+
+        return recorded_step(self.times, in_lanes, lane_state, record, iteration, entry)
 
     def arriving(self, lane_state: LaneState, steps: StepRecord) -> Float[Array, "iterations components lanes"] | None:
-        """The derivatives of the measured quantity with respect to the states at the ends of the steps, apart from those
-        through later states; `None` if the quantity depends only on the ends of the runs."""
-        return None
+        """The derivatives of the sum with respect to the states at the ends of the steps, apart from those through later
+        states; `None` without samples."""
+        if self.times is None or self.cotangents is None or steps.fixed is None:
+            return None
+        rows = self.cotangents.states.at[self.times.cell_of(lane_state), steps.sample].get(mode="fill", fill_value=0.0)
+        # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
+        return jnp.where(steps.fixed, 0.0, jnp.moveaxis(rows, -1, 1))
 
     def measured(self, problem: AbstractProblem, lane_state: LaneState) -> PyTree:
-        """The quantities to differentiate, for lanes that have ended: a tree of arrays with the lanes last."""
-        return time_of_zero(problem, problem.event_function, lane_state.time, lane_state.state)
+        """The quantities to differentiate, for lanes that have ended: the time of the event; or the time at which a run
+        leaves the domain, and the state."""
+        time, state = lane_state.time, lane_state.state
+        if self.times is None:
+            return time_of_zero(problem, problem.event_function, time, state)
+        if problem.domain_margin(time, state) is None:
+            return jnp.zeros_like(time), state
+        return time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, state), state
 
     def share_of_end(self, lane_state: LaneState) -> PyTree:
-        """The factors of the measured quantities at the end of the runs in the lanes."""
-        return jnp.ones_like(lane_state.time)
+        """The factors of the measured quantities in what is differentiated."""
+        if self.times is None or self.cotangents is None:
+            return jnp.ones_like(lane_state.time)
+        cell, has_left = self.times.cell_of(lane_state), (lane_state.status == LEFT_DOMAIN) & (lane_state.time > 0.0)
+        at_end = jnp.where(lane_state.status == REACHED_END, self.cotangents.end_state[:, cell], 0.0)
+        return jnp.where(has_left, self.cotangents.end_time[cell], 0.0), at_end
+
+
+#: A tree of booleans like a problem: the leaves with respect to which to differentiate.
+Moving: TypeAlias = PyTree
 
 
 class Derivatives(NamedTuple):
@@ -183,46 +305,29 @@ class Derivatives(NamedTuple):
     numbers: PyTree
 
 
-class Backward(NamedTuple):
-    """State of the forward pass and of the backward pass.
-
-    `frontier` holds the lanes at the start of the next period to compute, and `number` its number. The backward pass takes
-    the period before number `limit` next. `adjoint` holds the derivatives for the cell in each lane, `gradient` those of
-    every cell with respect to its initial state.
-    """
-
-    frontier: SchedulerState
-    number: Int[Array, ""]
-    limit: Int[Array, ""]
-    checkpoints: Checkpoints
-    latest_steps: LatestSteps
-    outcome: Outcome
-    adjoint: Derivatives
-    gradient: Derivatives
-
-
 def solve_with_adjoint(
-    problem: AbstractProblem,
-    moving: Moving,
-    probe: Tangent,
-    ends_on_event: bool,
-    options: RunOptions,
-    recorder: StepRecorder,
+    problem: AbstractProblem, probe: Tangent, ends_on_event: bool, options: RunOptions, recorder: StepRecorder
 ) -> tuple[Outcome, Derivatives]:
-    """Run every cell to its end, and differentiate the quantity that a recorder measures there.
+    """Run every cell to its end, and differentiate what a recorder measures.
 
     **Arguments:**
 
-    - `moving`: the leaves with respect to which to differentiate, scalars or (..., cells).
     - `probe`: a tangent of the problem. Its variation is also integrated and takes part in step-size control, so that
       the steps suit tangents even where the state is at rest.
     - `ends_on_event`: as for `VariationalProblem`.
-    - `recorder`: the recorder of the steps, which may add derivatives at the ends of the steps.
 
     **Returns:** the `Outcome`, without crossing times; and the derivatives of every cell with respect to its initial
-    state and to the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
+    state and to the parameters that the tangent moves, one per cell, in a tree like the problem with `None` for the other
+    leaves and for those that do not matter.
     """
     components, size = problem.start()[0].shape
+
+    def field_and_end(problem: AbstractProblem, states: States) -> PyTree:
+        zero = jnp.zeros_like(states[0])
+        end = problem.event_function(states) if recorder.times is None else problem.domain_margin(zero, states)
+        return problem.field(zero, states), end, problem.jumps(zero, states)
+
+    moving = moving_leaves(problem, probe, field_and_end)
     numbers, static = eqx.partition(problem, moving)
     numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], size)), numbers)
     problem = eqx.combine(numbers, static)
@@ -233,161 +338,98 @@ def solve_with_adjoint(
         problem,
         is_leaf=lambda rate: rate is None,
     )
-    variational = VariationalProblem(problem, (probe,), ends_on_event)
-    scheduler = LaneScheduler.of(variational, *options, one_kernel=True, n_blocks=2)
+    scheduler = LaneScheduler.of(
+        VariationalProblem(problem, (probe,), ends_on_event), *options, one_kernel=True, n_blocks=2
+    )
     # Without tangents, a `VariationalProblem` is the problem itself, with the option not to end on its event.
-    passes = Passes(scheduler, VariationalProblem(moving, (), ends_on_event), recorder)
-    run = passes.start(VariationalProblem(numbers, (), ends_on_event))
-    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.outcome.steps[0]), passes.there_and_back, run)
-    gradient = Derivatives(run.gradient.state, run.gradient.numbers.problem)
-    return run.outcome._replace(state=run.outcome.state[:components]), gradient
+    moving, numbers = (VariationalProblem(leaves, (), ends_on_event) for leaves in (moving, numbers))
 
+    def forward(_: Int[Array, ""], before: SchedulerState, other: PyTree) -> tuple[SchedulerState, Period, PyTree]:
+        after, record = scheduler.run(before, recorder)
+        latest_steps, outcome = other
+        other = (latest_steps.added(before.iterations, record.rows), scheduler.store(outcome, after.lane_state))
+        return scheduler.refill(after), (before, after), other
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Passes:
-    """The forward pass, which computes periods, and the backward pass, which carries derivatives through them.
+    def is_kept(period: Period, other: PyTree) -> Bool[Array, ""]:
+        return period[0].iterations >= other[0].first
 
-    `moving`, `recorder`: as for `solve_with_adjoint`.
-    """
-
-    scheduler: LaneScheduler
-    moving: Moving
-    recorder: StepRecorder
-
-    def start(self, numbers: PyTree) -> Backward:
-        """Both passes before the first period. **Arguments:** `numbers`: the parameters, with one value per cell."""
-        scheduler, start = self.scheduler, self.scheduler.start()
-        in_lanes = scheduler.in_lanes(start.lane_state)
-        state, states = (without_probe(lanes).state for lanes in (start.lane_state, scheduler.fresh))
-        record = jax.eval_shape(lambda: self.recorder.steps(self.recorder.begin(in_lanes, start.lane_state, None)))
-        return Backward(
-            frontier=start,
-            number=jnp.zeros((), int),
-            limit=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
-            checkpoints=Checkpoints.none((start, start)),
-            latest_steps=LatestSteps.none(record, scheduler.capacity),
-            outcome=outcome_of(scheduler.fresh),
-            adjoint=jax.tree.map(jnp.zeros_like, Derivatives(state, scheduler.pick(numbers, start.lane_state.cell))),
-            gradient=jax.tree.map(jnp.zeros_like, Derivatives(states, numbers)),
-        )
-
-    def there_and_back(self, run: Backward) -> Backward:
-        """Compute all periods up to the one that the backward pass needs, and take back those whose steps are kept."""
-        run = jax.lax.while_loop(self.is_ahead, self.forward, run)
-        run = run._replace(limit=jnp.minimum(run.limit, run.number))
-        run = jax.lax.while_loop(self.is_recorded, self.backward, run)
-        # The steps before are gone: continue from the latest checkpoint.
-        number, (lanes_before, _), checkpoints = run.checkpoints.latest()
-        return run._replace(
-            frontier=lanes_before,
-            number=number,
-            checkpoints=checkpoints,
-            latest_steps=run.latest_steps._replace(first=lanes_before.iterations),
-        )
-
-    def is_ahead(self, run: Backward) -> Bool[Array, ""]:
-        """Whether a period that the backward pass needs has not been computed."""
-        return uncounted(self.scheduler.unfinished(run.frontier) & (run.number < run.limit), run.number)
-
-    def forward(self, run: Backward) -> Backward:
-        """Compute the next period, and record its steps."""
-        lanes_after, record = self.scheduler.run(run.frontier, self.recorder)
-        return run._replace(
-            frontier=self.scheduler.refill(lanes_after),
-            number=run.number + 1,
-            checkpoints=run.checkpoints.added(run.number, (run.frontier, lanes_after)),
-            latest_steps=run.latest_steps.added(run.frontier.iterations, self.recorder.steps(record)),
-            outcome=self.scheduler.store(run.outcome, lanes_after.lane_state),
-        )
-
-    def is_recorded(self, run: Backward) -> Bool[Array, ""]:
-        """Whether the steps of the period that the backward pass takes next are kept."""
-        number, (lanes_before, _), _ = run.checkpoints.latest()
-        recorded = (number == run.limit - 1) & (lanes_before.iterations >= run.latest_steps.first)
-        return uncounted((run.checkpoints.depth > 0) & recorded, run.number)
-
-    def backward(self, run: Backward) -> Backward:
-        """Carry the derivatives through the latest period."""
-        scheduler, (number, (lanes_before, lanes_after), checkpoints) = self.scheduler, run.checkpoints.latest()
-        steps = run.latest_steps.of_period(lanes_before.iterations, self.recorder.period)
-        count = lanes_after.iterations - lanes_before.iterations
-        adjoint = self.taken_back(lanes_after.lane_state, steps, count, run.adjoint)
+    def backward(
+        _: Int[Array, ""], period: Period, other: PyTree, carried: tuple[Derivatives, Derivatives]
+    ) -> tuple[Derivatives, Derivatives]:
+        (before, after), (adjoint, gradient) = period, carried
+        steps = other[0].of_period(before.iterations, recorder.period)
+        count = after.iterations - before.iterations
+        adjoint = period_taken_back(scheduler, moving, recorder, after.lane_state, steps, count, adjoint)
         # A cell that had made no step was at its start.
-        at_its_start = (lanes_before.lane_state.steps == 0) & (lanes_before.lane_state.cell < scheduler.cells)
-        cell = jnp.where(at_its_start, lanes_before.lane_state.cell, scheduler.capacity)
+        at_its_start = (before.lane_state.steps == 0) & (before.lane_state.cell < scheduler.cells)
+        cell = jnp.where(at_its_start, before.lane_state.cell, scheduler.capacity)
         gradient = jax.tree.map(
-            lambda of_cells, of_lanes: of_cells.at[..., cell].set(of_lanes, mode="drop"), run.gradient, adjoint
+            lambda of_cells, of_lanes: of_cells.at[..., cell].set(of_lanes, mode="drop"), gradient, adjoint
         )
-        return run._replace(limit=number, checkpoints=checkpoints, adjoint=adjoint, gradient=gradient)
+        return adjoint, gradient
 
-    def taken_back(
-        self, lane_state: LaneState, steps: StepRecord, count: Int[Array, ""], adjoint: Derivatives
-    ) -> Derivatives:
-        """Carry the derivatives from the end of a period to its start; in lanes that have ended, the derivatives begin
-        there.
-        """
-        weights, lane_state = Weights.of(self.scheduler.control.tableau), without_probe(lane_state)
-        # Selected here: XLA 0.10.2 aborts on a kernel that takes the initial states of all cells if they are constants.
-        problem = dataclasses.replace(self.scheduler.in_lanes(lane_state)[0], tangents=())
-        arriving, share = self.recorder.arriving(lane_state, steps), self.recorder.share_of_end(lane_state)
-        record = (steps.time, steps.state, steps.length, arriving)
+    start = scheduler.start()
+    state, states = (without_probe(lanes).state for lanes in (start.lane_state, scheduler.fresh))
+    record = jax.eval_shape(lambda: recorder.begin(scheduler.in_lanes(start.lane_state), start.lane_state, None).rows)
+    other = (LatestSteps.none(record, scheduler.capacity), outcome_of(scheduler.fresh))
+    carried = (Derivatives(state, scheduler.pick(numbers, start.lane_state.cell)), Derivatives(states, numbers))
+    run = there_and_back(
+        (start, (start, start), other, jax.tree.map(jnp.zeros_like, carried)),
+        jnp.iinfo(jnp.arange(0).dtype).max,
+        scheduler.unfinished,
+        is_kept,
+        forward,
+        backward,
+    )
+    outcome, gradient = run.other[1], run.adjoint[1]
+    return outcome._replace(state=outcome.state[:components]), Derivatives(gradient.state, gradient.numbers.problem)
 
-        def loop(carry: PyTree) -> Derivatives:
-            lane_state, share, record, count, adjoint = carry
-            ended = lane_state.status != RUNNING
-            numbers, static = eqx.partition(problem, self.moving)
 
-            def measured(numbers: PyTree, state: States) -> PyTree:
-                return self.recorder.measured(eqx.combine(numbers, static).problem, lane_state._replace(state=state))
+def period_taken_back(
+    scheduler: LaneScheduler,
+    moving: Moving,
+    recorder: StepRecorder,
+    lane_state: LaneState,
+    steps: StepRecord,
+    count: Int[Array, ""],
+    adjoint: Derivatives,
+) -> Derivatives:
+    """Carry the derivatives from the end of a period to its start; in lanes that have ended, the derivatives begin there."""
+    tableau, lane_state = scheduler.control.tableau, without_probe(lane_state)
+    # Selected here: XLA 0.10.2 aborts on a kernel that takes the initial states of all cells if they are constants.
+    problem = dataclasses.replace(scheduler.in_lanes(lane_state)[0], tangents=())
+    record = (steps.time, steps.state, steps.length, recorder.arriving(lane_state, steps))
 
-            by_number, by_state = jax.vjp(measured, numbers, lane_state.state)[1](share)
-            at_end = Derivatives(by_state, by_number)
-            adjoint = jax.tree.map(functools.partial(jnp.where, ended), at_end, adjoint)
+    def loop(carry: PyTree) -> Derivatives:
+        lane_state, share, record, count, adjoint = carry
+        ended = lane_state.status != RUNNING
+        numbers, static = eqx.partition(problem, moving)
 
-            def step(carry: tuple[Array, Derivatives, StageMemory]) -> tuple[Array, Derivatives, StageMemory]:
-                index, adjoint, memory = carry
-                time, state, length, at_end = jax.tree.map(functools.partial(read, index=index - 1), record)
-                if at_end is not None:
-                    adjoint = adjoint._replace(state=adjoint.state + at_end)
-                point = (time, state, length)
-                return index - 1, *step_taken_back(weights, problem, self.moving, *point, adjoint, memory)
+        def measured(numbers: PyTree, state: States) -> PyTree:
+            return recorder.measured(eqx.combine(numbers, static).problem, lane_state._replace(state=state))
 
-            state, stages = lane_state.state, len(weights.fractions)
-            sizes = (stages, stages - 1, stages + 1)
-            memory = StageMemory(*(jnp.zeros((size, *state.shape), state.dtype) for size in sizes))
-            return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, memory))[1]
+        by_number, by_state = jax.vjp(measured, numbers, lane_state.state)[1](share)
+        at_end = Derivatives(by_state, by_number)
+        adjoint = jax.tree.map(functools.partial(jnp.where, ended), at_end, adjoint)
 
-        return self.scheduler.in_kernel(loop)((lane_state, share, record, count, adjoint))
+        def step(carry: tuple[Array, Derivatives, StageMemory]) -> tuple[Array, Derivatives, StageMemory]:
+            index, adjoint, memory = carry
+            time, state, length, at_end = jax.tree.map(functools.partial(read, index=index - 1), record)
+            if at_end is not None:
+                adjoint = adjoint._replace(state=adjoint.state + at_end)
+            return index - 1, *step_taken_back(tableau, problem, moving, time, state, length, adjoint, memory)
+
+        state, stages = lane_state.state, 1 + inner_stages(tableau)
+        sizes = (stages, stages - 1, stages + 1)
+        memory = StageMemory(*(jnp.zeros((size, *state.shape), state.dtype) for size in sizes))
+        return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, memory))[1]
+
+    return scheduler.in_kernel(loop)((lane_state, recorder.share_of_end(lane_state), record, count, adjoint))
 
 
 def without_probe(lane_state: LaneState) -> LaneState:
     """The lanes with the states alone, without the variations."""
     return lane_state._replace(state=lane_state.state[: lane_state.state.shape[0] // 2])
-
-
-class Weights(NamedTuple):
-    """The coefficients of a Runge-Kutta method that its adjoint needs.
-
-    `fractions`: the position of each stage in the step; `rows`: the weights of each stage but the first; `shares`: for
-    each stage, the share of its rate in the end of the step and in the later stages.
-    """
-
-    fractions: Float[np.ndarray, " stages"]
-    rows: tuple[Float[np.ndarray, " _"], ...]
-    shares: Float[np.ndarray, "stages 1+stages"]
-
-    @classmethod
-    def of(cls, tableau: diffrax.ButcherTableau) -> "Weights":
-        """The weights of a method, without a last stage that only serves the next step."""
-        weights, fractions, rows = tableau.b_sol, np.array([0.0, *tableau.c]), tableau.a_lower
-        if tableau.fsal:
-            weights, fractions, rows = rows[-1], fractions[:-1], rows[:-1]
-        stages = len(fractions)
-        shares = np.zeros((stages, 1 + stages))
-        shares[:, 0] = weights
-        for stage, row in enumerate(rows, start=1):
-            shares[: len(row), 1 + stage] = row
-        return cls(fractions, tuple(rows), shares)
 
 
 class StageMemory(NamedTuple):
@@ -403,7 +445,7 @@ class StageMemory(NamedTuple):
 
 
 def step_taken_back(
-    weights: Weights,
+    tableau: diffrax.ButcherTableau,
     problem: AbstractProblem,
     moving: Moving,
     time: Lanes,
@@ -418,7 +460,7 @@ def step_taken_back(
 
     **Arguments:**
 
-    - `weights`: the method.
+    - `tableau`: the method; a last stage that only serves the next step does not count.
     - `problem`, `moving`: the problem, with leaves that are scalars or have one number per lane; the leaves with
       respect to which to differentiate.
     - `time`, `state`, `length`: where the step starts, and its length; 0 if no step was made.
@@ -428,16 +470,20 @@ def step_taken_back(
     **Returns:** the derivatives at the start, and the memory for reuse.
     """
     numbers, static = eqx.partition(problem, moving)
-    stages = len(weights.fractions)
-    fractions = jnp.asarray(weights.fractions)
+    inner = inner_stages(tableau)
+    stages, rows = 1 + inner, tableau.a_lower[:inner]
+    fractions = jnp.array([0.0, *tableau.c[:inner]])
+    # For each stage, the share of its rate in the end of the step and in the later stages.
+    shares = np.zeros((stages, 1 + stages))
+    shares[:, 0] = tableau.b_sol[:stages]
+    for stage, row in enumerate(rows, start=1):
+        shares[: len(row), 1 + stage] = row
 
     def stage_made(stage: Int[Array, ""], carry: tuple[Stages, Array]) -> tuple[Stages, Array]:
         stage_states, rates = carry
         rate = problem.field(time + fractions[stage] * length, read(stage_states, index=stage))
         rates = written_by_component(rates, rate, at=stage)
-        return written_in_place(
-            stage_states, moved_state(stage, weights.rows, state, length, rates), at=stage + 1
-        ), rates
+        return written_in_place(stage_states, moved_state(stage, rows, state, length, rates), at=stage + 1), rates
 
     start = jnp.zeros((), int)
     initial_stages = written_in_place(memory.states, state, at=start), memory.rates
@@ -445,7 +491,7 @@ def step_taken_back(
 
     def stage_taken_back(count: Int[Array, ""], carry: tuple[Stages, Derivatives]) -> tuple[Stages, Derivatives]:
         stage, (by_stage, total) = stages - 1 - count, carry
-        by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, zero_state, length, by_stage))
+        by_rate = jax.lax.optimization_barrier(moved_state(stage, shares, zero_state, length, by_stage))
         stage_time = time + fractions[stage] * length
 
         def field(numbers: PyTree, parts: tuple[Lanes, ...]) -> States:
@@ -577,27 +623,74 @@ def _slopes_by_adjoint(
     problem: AbstractProblem, tangents: Tangents, ends_on_event: bool, options: RunOptions
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
-
-    def field_and_event(problem: AbstractProblem, states: States) -> PyTree:
-        zero = jnp.zeros_like(states[0])
-        return problem.field(zero, states), problem.event_function(states), problem.jumps(zero, states)
-
-    moving = moving_leaves(problem, tangents[0], field_and_event)
     shares = shares_of(len(tangents)).tolist()
     mixture = jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
-    ended, gradient = solve_with_adjoint(problem, moving, mixture, ends_on_event, options, StepRecorder())
-    by_start, by_number = gradient
+    ended, (by_start, by_number) = solve_with_adjoint(problem, mixture, ends_on_event, options, StepRecorder())
 
     def slope(direction: Tangent) -> Float[Array, " cells"]:
         start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]
-        rates = eqx.filter(direction, moving)
-        shares = [
-            jnp.sum((gradient * rate).reshape(-1, by_start.shape[1]), axis=0)
-            for gradient, rate in zip(jax.tree.leaves(by_number), jax.tree.leaves(rates), strict=True)
-        ]
+        pairs = zip(jax.tree.leaves(by_number), jax.tree.leaves(where_active(direction, by_number)), strict=True)
+        shares = [jnp.sum((gradient * rate).reshape(-1, by_start.shape[1]), axis=0) for gradient, rate in pairs]
         return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
 
     return ended, [slope(direction) for direction in tangents]
+
+
+# The derivatives of a sum over the samples of a run with respect to any number of parameters, by one backward pass.
+#
+# The run is repeated, with steps that also suit a tangent, and its steps are recorded. The backward pass adds the cotangent
+# of each sample where it passes the sample's time. Neither the cost nor the memory depends on the number of parameters, apart
+# from the field's own share.
+
+
+def samples_pulled_back(
+    build: Callable[..., AbstractProblem],
+    point: tuple[Float[Array, "... cells"], ...],
+    cotangents: SampledCotangents,
+    times: Float[Array, "times *cells"],
+    t1: Float[Array, "..."],
+    settings: Settings,
+    rates: list[Float[Array, "... cells"]] | None = None,
+) -> list[Float[Array, "... cells"]]:
+    """The cotangents of a problem's numbers from those of its samples.
+
+    **Arguments:**
+
+    - `build`: numbers -> problem; `point`: the numbers, with the cells last.
+    - `cotangents`: those of the samples, 0 after the end of a run, and of the end.
+    - `times`, `t1`, `settings`: as for `solve_with_samples`.
+    - `rates`: a tangent of the numbers, which the steps must suit; by default one that moves every number.
+
+    **Returns:** the cotangents, in the shapes of the numbers; NaN in cells that fail with the steps that suit the tangent.
+    """
+    problem, cells = build(*point), point[0].shape[-1]
+    probe = tangents_of(build, point, [tuple(mixture(point) if rates is None else rates)])[0]
+    recorder = StepRecorder(SampleTimes.of(times, cells, components), cotangents)
+    options = (t1, jnp.asarray(cells), settings)
+    outcome, (by_start, by_number) = solve_with_adjoint(problem, probe, False, options, recorder)
+    sample_times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells)).T
+    is_moved = VariationalProblem(problem, (probe,), False).start()[0][len(by_start) :] != 0.0
+    initial = jnp.where((sample_times <= 0.0)[..., None] & is_moved.T[:, None], cotangents.states, 0.0)
+    is_lost = jnp.any(jnp.any(cotangents.states != 0.0, axis=-1) & (sample_times > outcome.end_time[:, None]), axis=1)
+    is_lost |= jnp.any(cotangents.end_state != 0.0, axis=0)
+    by_start = by_start + jnp.sum(initial, axis=1).T
+
+    def numbers_and_start(*point: Float[Array, "... cells"]) -> PyTree:
+        problem = build(*point)
+        return where_active(problem, by_number), problem.start()[0]
+
+    by_point = jax.vjp(numbers_and_start, *point)[1]((by_number, by_start))
+    return [jnp.where(is_lost & (outcome.status == FAILED), jnp.nan, part) for part in by_point]
+
+
+def mixture(point: tuple[Float[Array, "... cells"], ...]) -> list[Float[Array, "... cells"]]:
+    """A direction that moves every number by a share of its own size."""
+    counts = [number[..., 0].size for number in point]
+    shares = np.split(shares_of(sum(counts)), np.cumsum(counts)[:-1])
+    return [
+        jnp.asarray(share).reshape(*number.shape[:-1], 1) * tangent_scale(number)
+        for share, number in zip(shares, point, strict=True)
+    ]
 
 
 def shares_of(count: int) -> Float[np.ndarray, " count"]:

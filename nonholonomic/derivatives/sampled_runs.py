@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, Self, TypeAlias
 
@@ -10,17 +9,12 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from ..integration import AbstractProblem, CoreProblem, Lanes, LaneState, Settings, States, sample, solve_with_samples
-from ..integration.dense import SampledSolution
-from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, event_time
-from ..integration.runge_kutta import Integers
-from ..integration.samples import Record, SampleTimes, components, step_towards_sample
-from ..integration.scheduler import NO_EXTREMES, InLanes
+from ..integration import AbstractProblem, CoreProblem, Outcome, Settings, States, sample, solve_with_samples
+from ..integration.problem import LEFT_DOMAIN, event_time
 from ..validation import as_number
-from .adjoint import StepRecord, StepRecorder, shares_of, solve_with_adjoint, time_of_zero, without_probe
+from .adjoint import SampledCotangents, samples_pulled_back
 from .differentiable import AbstractDifferentiableSolve, Structure, differentiable_solve
 from .variation import (
     Tangent,
@@ -28,249 +22,94 @@ from .variation import (
     VariationalProblem,
     by_active,
     in_groups,
-    moving_leaves,
     probed,
     tangent_along,
-    tangent_scale,
     tangents_by,
-    tangents_of,
 )
-
-# The derivatives of a sum over the samples of a run with respect to any number of parameters, by one backward pass.
-#
-# The run is repeated, with steps that also suit a tangent, and its steps are recorded (`adjoint.py`). The backward pass
-# adds the cotangent of each sample where it passes the sample's time. Neither the cost nor the memory depends on the number
-# of parameters, apart from the field's own share.
-
-
-class SampledCotangents(NamedTuple):
-    """The cotangents of the samples, of the time at which a run leaves the domain, and of the state at the horizon."""
-
-    states: Float[Array, "cells times components"]
-    end_time: Float[Array, " cells"]
-    end_state: Float[Array, "components cells"]
-
-    @classmethod
-    def of(
-        cls,
-        problem: AbstractProblem,
-        times: int,
-        core: Float[Array, "cells times components"] | None,
-        quadratures: Float[Array, "cells times quadratures"] | None,
-        end_time: Float[Array, " cells"] | None,
-    ) -> "SampledCotangents":
-        """The cotangents of a problem's core components, quadratures and end time, zero where they are `None`."""
-        components, cells = problem.start()[0].shape
-        leading = components if problem.leading is None else problem.leading
-        states = [
-            jnp.zeros((cells, times, size)) if part is None else part
-            for part, size in ((core, leading), (quadratures, components - leading))
-        ]
-        end_time = jnp.zeros(cells) if end_time is None else end_time
-        return cls(jnp.concatenate(states, axis=-1), end_time, jnp.zeros((components, cells)))
-
-
-class SampledStepRecorder(StepRecorder):
-    """Records steps that end on the samples; the cotangents of the samples enter where the steps end."""
-
-    times: SampleTimes
-    cotangents: SampledCotangents
-
-    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: None) -> Record:
-        steps = super().begin(in_lanes, lane_state, collected)
-        sample = self.times.after(lane_state.time, lane_state)
-        samples, fixed = jnp.zeros(steps.length.shape, sample.dtype), jnp.zeros(steps.state.shape, bool)
-        return Record(jnp.ones(sample.shape, bool), sample, steps._replace(sample=samples, fixed=fixed))
-
-    def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: Record, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, Record]:
-        state = without_probe(lane_state).state
-
-        def entry(new_lanes: LaneState, length: Lanes, sample: Integers) -> StepRecord:
-            moved = jnp.where(new_lanes.time > lane_state.time, length, 0.0)
-            return StepRecord(lane_state.time, state, moved, sample, new_lanes.state[len(state) :] == 0.0)
-
-        return step_towards_sample(self.times, in_lanes, lane_state, record, iteration, entry)
-
-    def steps(self, record: Record) -> StepRecord:
-        return record.rows
-
-    def arriving(self, lane_state: LaneState, steps: StepRecord) -> Float[Array, "iterations components lanes"]:
-        assert steps.fixed is not None
-        rows = self.cotangents.states.at[self.times.cell_of(lane_state), steps.sample].get(mode="fill", fill_value=0.0)
-        # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
-        return jnp.where(steps.fixed, 0.0, jnp.moveaxis(rows, -1, 1))
-
-    def share_of_end(self, lane_state: LaneState) -> tuple[Lanes, States]:
-        cell, has_left = self.times.cell_of(lane_state), (lane_state.status == LEFT_DOMAIN) & (lane_state.time > 0.0)
-        at_end = jnp.where(lane_state.status == REACHED_END, self.cotangents.end_state[:, cell], 0.0)
-        return jnp.where(has_left, self.cotangents.end_time[cell], 0.0), at_end
-
-    def measured(self, problem: AbstractProblem, lane_state: LaneState) -> tuple[Lanes, States]:
-        """The time at which a run leaves the domain, and the state at the end."""
-        time, state = lane_state.time, lane_state.state
-        if problem.domain_margin(time, state) is None:
-            return jnp.zeros_like(time), state
-        return time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, state), state
-
-
-def samples_pulled_back(
-    build: Callable[..., AbstractProblem],
-    point: tuple[Float[Array, "... cells"], ...],
-    cotangents: SampledCotangents,
-    times: Float[Array, "times *cells"],
-    t1: Float[Array, "..."],
-    settings: Settings,
-    rates: list[Float[Array, "... cells"]] | None = None,
-) -> list[Float[Array, "... cells"]]:
-    """The cotangents of a problem's numbers from those of its samples.
-
-    **Arguments:**
-
-    - `build`: numbers -> problem; `point`: the numbers, with the cells last.
-    - `cotangents`: those of the samples, 0 after the end of a run, and of the end.
-    - `times`, `t1`, `settings`: as for `solve_with_samples`.
-    - `rates`: a tangent of the numbers, which the steps must suit; by default one that moves every number.
-
-    **Returns:** the cotangents, in the shapes of the numbers; NaN in cells that fail with the steps that suit the tangent.
-    """
-    problem, cells = build(*point), point[0].shape[-1]
-    probe = tangents_of(build, point, [tuple(mixture(point) if rates is None else rates)])[0]
-
-    def field_and_margin(problem: AbstractProblem, states: States) -> PyTree:
-        time = jnp.zeros_like(states[0])
-        return problem.field(time, states), problem.domain_margin(time, states), problem.jumps(time, states)
-
-    moving = moving_leaves(problem, probe, field_and_margin)
-    recorder = SampledStepRecorder(SampleTimes.of(times, cells, components), cotangents)
-    options = (t1, jnp.asarray(cells), settings)
-    outcome, (by_start, by_number) = solve_with_adjoint(problem, moving, probe, False, options, recorder)
-    sample_times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells)).T
-    is_moved = VariationalProblem(problem, (probe,), False).start()[0][len(by_start) :] != 0.0
-    initial = jnp.where((sample_times <= 0.0)[..., None] & is_moved.T[:, None], cotangents.states, 0.0)
-    is_lost = jnp.any(jnp.any(cotangents.states != 0.0, axis=-1) & (sample_times > outcome.end_time[:, None]), axis=1)
-    is_lost |= jnp.any(cotangents.end_state != 0.0, axis=0)
-    by_start = by_start + jnp.sum(initial, axis=1).T
-
-    def numbers_and_start(*point: Float[Array, "... cells"]) -> PyTree:
-        problem = build(*point)
-        return eqx.filter(problem, moving), problem.start()[0]
-
-    by_point = jax.vjp(numbers_and_start, *point)[1]((by_number, by_start))
-    return [jnp.where(is_lost & (outcome.status == FAILED), jnp.nan, part) for part in by_point]
-
-
-def mixture(point: tuple[Float[Array, "... cells"], ...]) -> list[Float[Array, "... cells"]]:
-    """A direction that moves every number by a share of its own size."""
-    counts = [number[..., 0].size for number in point]
-    shares = np.split(shares_of(sum(counts)), np.cumsum(counts)[:-1])
-    return [
-        jnp.asarray(share).reshape(*number.shape[:-1], 1) * tangent_scale(number)
-        for share, number in zip(shares, point, strict=True)
-    ]
-
-
-def is_reversible(problem: AbstractProblem) -> bool:
-    """Whether the field of a single run has a backward pass; a loop without a fixed number of iterations has none."""
-    arrays, static = eqx.partition(problem, eqx.is_inexact_array)
-
-    def summed(arrays: PyTree, state: States) -> Float[Array, ""]:
-        return jnp.sum(eqx.combine(arrays, static).field(jnp.zeros_like(state[0]), state))
-
-    try:
-        jax.eval_shape(jax.grad(summed, (0, 1)), arrays, problem.start()[0])
-    except ValueError:
-        return False
-    return True
-
 
 # Samples of a run as a differentiable solve: its leaves, and how they are assembled into a problem.
 
 
-#: The times of the samples and the horizon [s], in a block with the cells last.
-Horizon: TypeAlias = tuple[Array, Array]
-
-
-class ProblemSpec(eqx.Module):
-    """How to build a problem from numbers and how to integrate it, except for the tolerance."""
-
-    build: Callable[..., PyTree] = eqx.field(static=True)
-    structure: Structure = eqx.field(static=True)
-    rest: PyTree
-    settings: Settings
-    grid: Float[Array, " steps"] | None
-    # The numbers of axes of the modules' numbers, without an axis of cells.
-    axes: tuple[int, ...] = eqx.field(static=True)
-
-    def of(self, numbers: tuple[Array, ...], *extra: object) -> PyTree:
-        """Build the problem from the modules, with their numbers replaced, and from the extra arguments of `build`."""
-        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), *extra)
+#: The times of the samples and the horizon [s], in a block with the cells last; the settings; and the ends of the steps [s]
+#: of a solver without an error estimate.
+Options: TypeAlias = tuple[Array, Array, Settings, Array | None]
 
 
 class AbstractSampling(AbstractDifferentiableSolve):
-    """Samples of a run. The leaves are the modules' numbers, the times, the horizon, the tolerance and the arrays of
-    the spec. `spec` is the rest of the spec, and `places` the positions of the arrays in it.
+    """Samples of a run. The leaves are the numbers of some modules, followed by all other arrays.
+
+    - `build`: builds what is run from the modules; `axes`: the number of axes of each of their numbers, without an axis of
+      cells.
+    - `structure`, `rest`: the places of the leaves among the modules' numbers, the `Options` and the rest of the modules;
+      and what is not an array there.
     """
 
-    spec: eqx.AbstractVar[ProblemSpec]
-    places: eqx.AbstractVar[Structure]
+    build: Callable[..., PyTree] = eqx.field(static=True)
+    axes: tuple[int, ...] = eqx.field(static=True)
+    structure: Structure = eqx.field(static=True)
+    rest: PyTree
+
+    @property
+    def movable(self) -> int:
+        return len(self.axes)
 
     @abc.abstractmethod
-    def built(self, spec: ProblemSpec, numbers: tuple[Array, ...], cells: int | None) -> PyTree:
-        """The problem of the modules' numbers, or what else is run; `cells` is `None` if the run is not in a block."""
+    def built(self, modules: PyTree, tolerance: Array, cells: int | None) -> PyTree:
+        """The problem of the modules, or what else is run; `cells` is `None` if the run is not in a block."""
 
     @abc.abstractmethod
-    def sampled(
-        self, built: PyTree, tangents: Tangents, horizon: Horizon, spec: ProblemSpec, nested: bool
-    ) -> tuple[PyTree, list[PyTree]]:
+    def sampled(self, built: PyTree, tangents: Tangents, options: Options, nested: bool) -> tuple[PyTree, list[PyTree]]:
         """The samples, and their derivative along each tangent, the cells first; `nested`: as for `value_and_tangents`."""
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> PyTree:
-        build, numbers, horizon, spec, lanes = self.builder(cells, leaves)
-        return self.sampled(build(numbers, lanes), (), horizon, spec, False)[0]
+        build, numbers, options, lanes = self.builder(cells, leaves)
+        return self.sampled(build(numbers, lanes), (), options, False)[0]
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[PyTree, list[PyTree]]:
-        build, numbers, horizon, spec, lanes = self.builder(cells, leaves)
+        build, numbers, options, lanes = self.builder(cells, leaves)
         built, tangents, gather = tangents_by(build, active, numbers, lanes)
-        samples, slopes = in_groups(lambda group: self.sampled(built, group, horizon, spec, nested), tangents)
+        samples, slopes = in_groups(lambda group: self.sampled(built, group, options, nested), tangents)
         return samples, gather(slopes)
 
     def push_forward(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
     ) -> PyTree:
-        build, numbers, horizon, spec, _ = self.builder(cells, leaves)
-        directions = [_cells_last(part, self.spec.axes[k], cells) for k, part in zip(active, tangents, strict=True)]
+        build, numbers, options, _ = self.builder(cells, leaves)
+        directions = [_cells_last(part, self.axes[k], cells) for k, part in zip(active, tangents, strict=True)]
         built, direction, size = tangent_along(build, active, numbers, tuple(directions), cells)
-        _, (slope,) = self.sampled(built, (direction,), horizon, spec, False)
+        _, (slope,) = self.sampled(built, (direction,), options, False)
         return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
 
-    def whole_spec(self, leaves: tuple[Array, ...]) -> ProblemSpec:
-        """The spec with its arrays."""
-        return eqx.combine(self.spec, jax.tree.unflatten(self.places, leaves[self.movable + 3 :]))
+    def unpacked(self, leaves: tuple[Array, ...]) -> tuple[PyTree, Options, PyTree]:
+        """The modules' numbers, as a tree, the options, and the rest of the modules."""
+        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest)
 
     def builder(
         self, cells: int, leaves: tuple[Array, ...]
-    ) -> tuple[Callable[..., PyTree], tuple[Array, ...], Horizon, ProblemSpec, int | None]:
+    ) -> tuple[Callable[..., PyTree], tuple[Array, ...], Options, int | None]:
         """What the leaves stand for.
 
         **Returns:** a function (the modules' numbers, cells) -> problem; the modules' numbers, in a block scalars or with
-        the cells last; the horizon; the whole spec, with the tolerance; and the number of cells, `None` outside of blocks.
+        the cells last; the options; and the number of cells, `None` outside of blocks.
         """
-        numbers, spec = leaves[: self.movable], self.whole_spec(leaves)
-        times, t1, tolerance = leaves[self.movable : self.movable + 3]
+        numbers, (times, t1, settings, grid), others = self.unpacked(leaves)
+        numbers, structure = jax.tree.flatten(numbers)
         if self.in_blocks:
-            numbers = tuple(_cells_last(number, axes, cells) for number, axes in zip(numbers, spec.axes, strict=True))
+            numbers = [_cells_last(number, axes, cells) for number, axes in zip(numbers, self.axes, strict=True)]
             # One tolerance serves the whole ensemble: the smallest of the batch.
-            times, tolerance = times if times.ndim == 1 else times.T, jnp.min(tolerance)
-        spec = dataclasses.replace(spec, settings=spec.settings.with_tolerance(tolerance))
-        build = functools.partial(self.built, spec)
-        return build, numbers, (times, t1), spec, cells if self.in_blocks else None
+            settings = settings.with_tolerance(jnp.min(settings.tolerance))
+            times = times if times.ndim == 1 else times.T
+
+        def build(numbers: tuple[Array, ...], cells: int | None) -> PyTree:
+            modules = eqx.combine(jax.tree.unflatten(structure, numbers), others)
+            return self.built(modules, settings.tolerance, cells)
+
+        return build, tuple(numbers), (times, t1, settings, grid), cells if self.in_blocks else None
 
 
 def _cells_last(number: Float[Array, "..."], axes: int, cells: int) -> Float[Array, "..."]:
@@ -284,7 +123,7 @@ def _cells_last(number: Float[Array, "..."], axes: int, cells: int) -> Float[Arr
 
 
 def solve_for_samples(
-    sampling: Callable[[int, ProblemSpec, Structure], AbstractSampling],
+    sampling: Callable[..., AbstractSampling],
     build: Callable[..., PyTree],
     modules: PyTree,
     times: Float[Array, " times"],
@@ -294,21 +133,16 @@ def solve_for_samples(
 ) -> Any:
     """Solve for the samples of a run.
 
-    **Arguments:** `sampling`: a function that returns the solve, given its first three fields; `build`: a function that
-    returns the problem, given the modules and extra arguments of the solve (the function is compared by identity);
-    other arguments as for `sampled_run`.
+    **Arguments:** `sampling`: a function that returns the solve, given the fields of an `AbstractSampling`; `build`: a
+    function that returns the problem, given the modules and what else the solve passes on (the function is compared by
+    identity); other arguments as for `sampled_run`.
     """
-    numbers, static = eqx.partition(modules, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(numbers)
+    numbers, others = eqx.partition(modules, eqx.is_inexact_array)
+    axes = tuple(map(jnp.ndim, jax.tree.leaves(numbers)))
     # Arrays, such as those of the solver, may be traced, so they belong to the leaves.
-    arrays, spec = eqx.partition(
-        ProblemSpec(build, structure, static, settings.with_tolerance(None), grid, tuple(map(jnp.ndim, leaves))),
-        eqx.is_array,
-    )
-    arrays_of_spec, places = jax.tree.flatten(arrays)
-    return differentiable_solve(
-        sampling(len(leaves), spec, places), *leaves, times, as_number(t1), settings.tolerance, *arrays_of_spec
-    )
+    arrays, rest = eqx.partition((numbers, (times, as_number(t1), settings, grid), others), eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    return differentiable_solve(sampling(build, axes, structure, rest), *leaves)
 
 
 #: Build a problem from some modules (scene, launch, ...) and a number of cells, `None` for a single run.
@@ -320,17 +154,22 @@ Build: TypeAlias = Callable[[PyTree, int | None], AbstractProblem]
 #: 5.5 and 4.8 backward (jax 0.10).
 MOST_FORWARD = 2
 
-#: In the derivative of a `SampledRun`: end state, status, and numbers and lengths of steps.
-NOT_DIFFERENTIATED: tuple[Any, ...] = (None,) * 5
+#: In place of numbers that a `SampledRun` lacks.
+ABSENT: Any = None
 
 
 class SampledRun(NamedTuple):
-    """A run at given times, as floats: its states, NaN after its end; when and where it ended; the status code
-    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`); the numbers of accepted and rejected steps; and the extremes of their
-    lengths, as in `integration.Outcome`.
+    """A run at given times, as floats.
 
-    `states` and `end_state` are the core components (the problem's `leading` ones), and `quadratures` are the passive
-    quadratures, `None` if there are none. If a program does not use `quadratures`, the ensemble runs without them.
+    - `states`: the core components (the problem's `leading` ones) or, of a run through modes, the output rows; NaN after
+      the end. `quadratures`: the passive quadratures, `None` if there are none; if a program does not use them, the
+      ensemble runs without them.
+    - `end_time`, `end_state`, `status`: when, where and how the run ended, a code of `integration.problem`.
+    - `steps`, `rejected`, `extremes`: as in `integration.Outcome`.
+    - `number`, `end_mode`, `counts`: of a run through modes, the index of the mode, or `BETWEEN`, at each time, and at the
+      end; and the counters.
+
+    The derivative of a run has only the first three, and the others are `None`.
 
     **Example:** as for `sampled_run`.
 
@@ -339,14 +178,17 @@ class SampledRun(NamedTuple):
     ('states', 'quadratures', 'end_time')
     """
 
-    states: Float[Array, "*cells times components"]
+    states: Float[Array, "*cells times rows"]
     quadratures: Float[Array, "*cells times quadratures"] | None
     end_time: Float[Array, "*cells"]
-    end_state: Float[Array, "*cells components"]
-    status: Float[Array, "*cells"]
-    accepted: Float[Array, "*cells"]
-    rejected: Float[Array, "*cells"]
-    extremes: Float[Array, "*cells 3"]
+    end_state: Float[Array, "*cells components"] = ABSENT
+    status: Float[Array, "*cells"] = ABSENT
+    steps: Float[Array, "*cells"] = ABSENT
+    rejected: Float[Array, "*cells"] = ABSENT
+    extremes: Float[Array, "*cells 3"] = ABSENT
+    number: Float[Array, "*cells times"] | None = None
+    end_mode: Float[Array, "*cells"] | None = None
+    counts: Float[Array, "*cells counters"] | None = None
 
 
 def sampled_run(
@@ -357,6 +199,7 @@ def sampled_run(
     settings: Settings,
     grid: Float[Array, " steps"] | None = None,
     *,
+    adjoint: diffrax.AbstractAdjoint | None = None,
     arrays_in_lanes: bool = False,
 ) -> SampledRun:
     """Run a problem inside a transformation and sample it, with derivatives that take part in step-size control.
@@ -373,6 +216,8 @@ def sampled_run(
     - `times`: times of the samples [s], increasing; `t1`: horizon [s].
     - `settings`: the tolerance may be traced.
     - `grid`: the ends of the steps [s], concrete, for a solver without an error estimate.
+    - `adjoint`: how Diffrax differentiates its steps, if Diffrax shall integrate the run. A generic tangent then keeps the
+      steps short enough for tangents; steps that end on a `grid` need none.
     - `arrays_in_lanes`: whether `build` accepts arrays in the modules, with the cells in their last axis, so that a batch
       with arrays is also solved as one ensemble.
 
@@ -386,6 +231,14 @@ def sampled_run(
     >>> print(f"{jax.grad(final)(2.0):.6f}")  # -0.3 exp(-0.6)
     -0.164643
     """
+    if adjoint is not None:
+        problem = build(modules, None)
+        outcome, states = sample(
+            probed(problem) if grid is None else problem, times, t1, settings, grid=grid, adjoint=adjoint
+        )
+        size = len(problem.start()[0])
+        outcome = outcome._replace(state=outcome.state[:size])
+        return _with_slopes(VariationalProblem(problem, (), False), outcome, states[:size].T)[0]
     arrays = [leaf for leaf in jax.tree.leaves(modules) if eqx.is_array(leaf) and leaf.ndim > 0]
     in_lanes = all(arrays_in_lanes and eqx.is_inexact_array(leaf) for leaf in arrays)
     kind = BlockSampling if in_lanes and isinstance(settings.for_lanes, diffrax.AbstractERK) else SingleSampling
@@ -441,79 +294,55 @@ def parted(problem: AbstractProblem, states: Float[Array, "*cells times all"]) -
     return states[..., : problem.leading], states[..., problem.leading :]
 
 
-def sampled_run_by_diffrax(
-    problem: AbstractProblem,
-    times: Float[Array, " times"],
-    t1: Float[Array, ""],
-    settings: Settings,
-    adjoint: diffrax.AbstractAdjoint,
-    grid: Float[Array, " steps"] | None = None,
-) -> SampledRun:
-    """Run a problem and let Diffrax differentiate its steps. A probe (`probed`) keeps the steps short enough for
-    tangents; fixed steps (`grid`) need none.
-
-    **Arguments:** as for `sampled_run`; `adjoint`: how Diffrax differentiates.
-
-    **Returns:** a `SampledRun`.
-
-    **Example:**
-
-    >>> import diffrax
-    >>> from nonholonomic.derivatives import sampled_run_by_diffrax
-    >>> times, adjoint = jnp.array([0.1, 0.3]), diffrax.ForwardMode()
-    >>> run = sampled_run_by_diffrax(Decays(jnp.asarray(2.0)), times, jnp.asarray(0.3), settings, adjoint)
-    >>> print(run.states[:, 0].round(6))
-    [0.818731 0.548812]
-    """
-    size = len(problem.start()[0])
-    leading = size if problem.leading is None else problem.leading
-    full_problem = probed(problem) if grid is None else problem
-    path = sample(full_problem, times, t1, settings, grid=grid, adjoint=adjoint)
-    status, accepted, rejected = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
-    states = parted(problem, path.states[:size].T)
-    return SampledRun(
-        *states, path.end_time, path.end_state[:leading], status, accepted, rejected, jnp.asarray(NO_EXTREMES)
-    )
-
-
-def _status(path: SampledSolution, t1: Float[Array, ""]) -> Int[Array, ""]:
-    """The status code of a single run."""
-    return jnp.where(path.lost, LEFT_DOMAIN, jnp.where(path.end_time < t1, FAILED, REACHED_END))
-
-
 class BlockSampling(AbstractSampling):
     """Samples by an ensemble solve, with passive quadratures or, if `core_only`, without them."""
 
-    movable: int
-    spec: ProblemSpec
-    places: Structure = eqx.field(static=True)
     core_only: bool = eqx.field(static=True, default=False)
 
-    def built(self, spec: ProblemSpec, numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
-        problem = spec.of(numbers, cells)
+    def built(self, modules: PyTree, tolerance: Array, cells: int | None) -> AbstractProblem:
+        problem = self.build(modules, cells)
         return core_problem(problem) if self.core_only else problem
 
     def sampled(
-        self, built: AbstractProblem, tangents: Tangents, horizon: Horizon, spec: ProblemSpec, nested: bool
+        self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool
     ) -> tuple[SampledRun, list[SampledRun]]:
-        return _samples_and_slopes(VariationalProblem(built, tangents, False), horizon, spec.settings, not nested)
+        return _samples_and_slopes(VariationalProblem(built, tangents, False), options[:3], not nested)
 
     def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
         if sum(leaves[k].size for k in active) <= MOST_FORWARD:
             return False
-        return is_reversible(self.whole_spec(leaves).of(leaves[: self.movable], None))
+        numbers, _, others = self.unpacked(leaves)
+        problem = self.build(eqx.combine(numbers, others), None)
+        arrays, static = eqx.partition(problem, eqx.is_inexact_array)
+
+        def summed(arrays: PyTree, state: States) -> Float[Array, ""]:
+            return jnp.sum(eqx.combine(arrays, static).field(jnp.zeros_like(state[0]), state))
+
+        # A loop without a fixed number of iterations has no backward pass.
+        try:
+            jax.eval_shape(jax.grad(summed, (0, 1)), arrays, problem.start()[0])
+        except ValueError:
+            return False
+        return True
 
     def differentiable(self, primal: SampledRun) -> SampledRun:
-        return SampledRun(primal.states, primal.quadratures, primal.end_time, *NOT_DIFFERENTIATED)
+        return SampledRun(primal.states, primal.quadratures, primal.end_time)
 
     def pull_back(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: SampledRun
     ) -> list[Float[Array, "cells ..."]]:
         solve = dataclasses.replace(self, core_only=True) if cotangents.quadratures is None else self
-        build, numbers, (times, t1), spec, _ = solve.builder(cells, leaves)
+        build, numbers, (times, t1, settings, _), _ = solve.builder(cells, leaves)
         rebuilt, point = by_active(build, active, numbers, cells)
-        by_samples = SampledCotangents.of(rebuilt(*point), len(times), *cotangents[:3])
-        by_point = samples_pulled_back(rebuilt, point, by_samples, times, t1, spec.settings)
+        problem, by_end = rebuilt(*point), cotangents.end_time
+        zeros = jnp.zeros((cells, len(times), len(problem.start()[0])))
+        pairs = zip(parted(problem, zeros), (cotangents.states, cotangents.quadratures), strict=True)
+        by_states = jnp.concatenate(
+            [zero if part is None else part for zero, part in pairs if zero is not None], axis=-1
+        )
+        by_end = jnp.zeros(cells) if by_end is None else by_end
+        by_samples = SampledCotangents(by_states, by_end, zeros[:, 0].T)
+        by_point = samples_pulled_back(rebuilt, point, by_samples, times, t1, settings)
         return [jnp.moveaxis(part, -1, 0) for part in by_point]
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
@@ -524,27 +353,22 @@ class BlockSampling(AbstractSampling):
 
 @eqx.filter_jit
 def _samples_and_slopes(
-    variational: VariationalProblem, horizon: Horizon, settings: Settings, one_kernel: bool
+    variational: VariationalProblem, options: tuple[Array, Array, Settings], one_kernel: bool
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The samples of the cells, and their derivative along each tangent."""
     cells = jnp.asarray(variational.problem.start()[0].shape[1])
-    options = {"n_blocks": 1 + len(variational.tangents), "one_kernel": one_kernel}
-    outcome, samples = solve_with_samples(variational, *horizon, cells, settings, **options)
-    counts = (outcome.steps - outcome.rejected, outcome.rejected, outcome.extremes.T)
-    return _found(variational, samples, (outcome.end_time, outcome.state, outcome.status), counts)
+    (times, t1, settings), n_blocks = options, 1 + len(variational.tangents)
+    arguments = (variational, times, t1, cells, settings)
+    return _with_slopes(variational, *solve_with_samples(*arguments, n_blocks=n_blocks, one_kernel=one_kernel))
 
 
-def _found(
-    variational: VariationalProblem,
-    samples: Float[Array, "*cells times components"],
-    ends: tuple[Float[Array, "*cells"], Float[Array, "components *cells"], Int[Array, "*cells"]],
-    counts: tuple[Int[Array, "*cells"], Int[Array, "*cells"], Float[Array, "*cells 3"]],
+def _with_slopes(
+    variational: VariationalProblem, outcome: Outcome, samples: Float[Array, "*cells times components"]
 ) -> tuple[SampledRun, list[SampledRun]]:
-    """The samples and their derivative along each tangent, given the time, the state and the status at which the runs
-    ended."""
+    """The samples and their derivative along each tangent, from the samples of states and variations."""
     states, *variations = jnp.split(samples, 1 + len(variational.tangents), axis=-1)
-    time, end, status = ends
-    end, *end_variations = variational.parts(end)
+    time, status = outcome.end_time, outcome.status
+    end, *end_variations = variational.parts(outcome.state)
 
     def end_time(problem: AbstractProblem, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
         return event_time(problem, lambda point: problem.domain_margin(time, point), time, state)
@@ -556,11 +380,12 @@ def _found(
             end_delay = eqx.filter_jvp(end_time, (variational.problem, end), (direction, at_end))[1]
             end_delay = jnp.where((status == LEFT_DOMAIN) & (time > 0.0), end_delay, 0.0)
         changes = parted(variational.problem, jnp.where(jnp.isnan(states), 0.0, variation))
-        return SampledRun(*changes, end_delay, *NOT_DIFFERENTIATED)
+        return SampledRun(*changes, end_delay)
 
     slopes = [slope(*parts) for parts in zip(variational.tangents, variations, end_variations, strict=True)]
-    numbers = (part.astype(float) for part in (status, *counts))
+    counts = (status, outcome.steps, outcome.rejected, jnp.moveaxis(outcome.extremes, 0, -1))
     end, _ = parted(variational.problem, jnp.moveaxis(end, 0, -1))
+    numbers = (part.astype(float) for part in counts)
     return SampledRun(*parted(variational.problem, states), time, end, *numbers), slopes
 
 
@@ -569,21 +394,15 @@ class SingleSampling(AbstractSampling):
 
     in_blocks = False
 
-    movable: int
-    spec: ProblemSpec
-    places: Structure = eqx.field(static=True)
-
-    def built(self, spec: ProblemSpec, numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
-        return spec.of(numbers, None)
+    def built(self, modules: PyTree, tolerance: Array, cells: int | None) -> AbstractProblem:
+        return self.build(modules, None)
 
     def sampled(
-        self, built: AbstractProblem, tangents: Tangents, horizon: Horizon, spec: ProblemSpec, nested: bool
+        self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool
     ) -> tuple[SampledRun, list[SampledRun]]:
-        variational, (_, t1) = VariationalProblem(built, tangents, False), horizon
-        path = sample(variational, *horizon, spec.settings, grid=spec.grid)
-        ends = (path.end_time, path.end_state, _status(path, t1))
-        counts = (path.accepted, path.rejected, jnp.asarray(NO_EXTREMES))
-        samples, slopes = _found(variational, path.states.T, ends, counts)
+        variational, (times, t1, settings, grid) = VariationalProblem(built, tangents, False), options
+        outcome, states = sample(variational, times, t1, settings, grid=grid)
+        samples, slopes = _with_slopes(variational, outcome, states.T)
 
         def jump_times(problem: AbstractProblem) -> Array | None:
             jumps = problem.jumps(jnp.zeros_like(t1), problem.start()[0])

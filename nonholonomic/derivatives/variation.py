@@ -8,14 +8,14 @@ import functools
 import math
 import operator
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import partial_eval
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.tracing import dependent_outputs
 from ..compilation.xla_cpu import traced_once
@@ -141,18 +141,17 @@ def tangents_by(
         assert len(slopes) == len(entries)
         remaining = iter(slopes)
 
+        def by_number(size: Array, part: Array) -> Array:
+            # The size is a scalar or has one value per cell.
+            return part / size.reshape((-1,) + (1,) * (part.ndim - 1) if size.ndim else ())
+
         def of_leaf(size: Array, shape: tuple[int, ...]) -> PyTree:
-            parts = [jax.tree.map(functools.partial(_by_size, size[k]), next(remaining)) for k in np.ndindex(shape)]
+            parts = [jax.tree.map(functools.partial(by_number, size[k]), next(remaining)) for k in np.ndindex(shape)]
             return jax.tree.map(lambda *parts: jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *shape), *parts)
 
         return [of_leaf(size, shape) for size, shape in zip(sizes, own_shapes, strict=True)]
 
     return rebuilt(*point), tangents_of(rebuilt, point, [along(*entry) for entry in entries]), gather
-
-
-def _by_size(size: Array, part: Array) -> Array:
-    """Convert a derivative along a number to one with respect to it; the number is a scalar or has one value per cell."""
-    return part / size.reshape((-1,) + (1,) * (part.ndim - 1) if size.ndim else ())
 
 
 def by_active(
@@ -335,12 +334,12 @@ def in_groups(run: Callable[..., tuple[PyTree, list[PyTree]]], tangents: Tangent
 # product of f. Tangents and lengths are those of the state in units of the problem's magnitudes.
 
 
-class VariedProblem(AbstractProblem):
+class VariedProblem(AbstractDerivedProblem):
     """A problem without its event, extended by a tangent and the logarithm of its growth.
 
     **Arguments:**
 
-    - `problem`: a problem; only its field and its domain margin are used.
+    - `problem`: a problem.
     - `states`: the problem's state, the tangent and the growth of every cell.
     - `magnitudes`: magnitudes of the problem's own components.
     - `begin`: the time of the problem [s] at the start.
@@ -351,39 +350,29 @@ class VariedProblem(AbstractProblem):
     magnitudes: Float[Array, "components cells"]
     begin: Float[Array, ""] | None = None
 
-    @property
-    def fast(self) -> tuple[bool, bool]:
-        return self.problem.fast
+    ends_on_event = False
 
     def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
         unit_scales = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
         return self.states, jnp.concatenate([self.magnitudes, unit_scales])
 
     def field(self, time: Lanes, state: States) -> States:
-        size, time = len(self.magnitudes), self._clock(time)
-        y, w = state[:size], state[size:-1]
+        time, y, w = self.clock(time), self.inner(state), state[len(self.magnitudes) : -1]
         rate, carried = jax.jvp(lambda point: self.problem.field(time, point), (y,), (w * self.magnitudes,))
         carried = carried / self.magnitudes
         growth = jnp.sum(w * carried, axis=0) / jnp.sum(w * w, axis=0)
         return jnp.concatenate([rate, carried - growth * w, growth[None]])
 
-    def event_function(self, state: States) -> None:
-        return None
+    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
+        return state[: len(self.magnitudes)]
 
-    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.problem.domain_margin(self._clock(time), state[: len(self.magnitudes)])
-
-    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
-        return self.problem.margins(self._clock(time), state[: len(self.magnitudes)])
+    def clock(self, time: Lanes) -> Lanes:
+        return time if self.begin is None else time + self.begin
 
     def jumps(self, time: Lanes, state: States) -> Jumps | None:
-        jumps = self.problem.jumps(self._clock(time), state[: len(self.magnitudes)])
+        jumps = super().jumps(time, state)
         begin = 0.0 if self.begin is None else self.begin
         return None if jumps is None else jumps._replace(times=jumps.times - begin)
-
-    def _clock(self, time: Lanes) -> Lanes:
-        """The time of the problem."""
-        return time if self.begin is None else time + self.begin
 
 
 def probed(problem: AbstractProblem) -> VariedProblem:
@@ -398,24 +387,19 @@ def probed(problem: AbstractProblem) -> VariedProblem:
     return VariedProblem(problem, states, magnitudes)
 
 
-class Growth(NamedTuple):
-    """Growth of a tangent in every cell, in equal intervals of time.
+def continued(before: PyTree, after: PyTree) -> tuple[Bool[np.ndarray, " cells"], PyTree]:
+    """The runs that had not ended before, and how all runs have ended.
 
-    - `logarithm`: logarithm of the growth in each interval.
-    - `status`: how the run ended, a code of `integration/problem.py`; `end_time` [s] and `state`: when and where it
-      ended; `steps`: number of accepted and rejected steps.
+    **Arguments:** `before`, `after`: the outcomes of the runs, and of their continuations for another interval of time.
     """
-
-    logarithm: Float[np.ndarray, "stretches cells"]
-    status: Int[np.ndarray, " cells"]
-    end_time: Float[np.ndarray, " cells"]
-    state: Float[np.ndarray, "components cells"]
-    steps: Int[np.ndarray, " cells"]
+    alive = np.isin(before.status, (RUNNING, REACHED_END))
+    added = {name: getattr(before, name) + getattr(after, name) for name in ("end_time", "steps", "rejected")}
+    return alive, jax.tree.map(lambda new, old: np.where(alive, new, old), after._replace(**added), before)
 
 
 def growth(
     problem: AbstractProblem, tangents: Float[Array, "components cells"], t1: float, stretches: int, settings: Settings
-) -> Growth:
+) -> tuple[Float[np.ndarray, "stretches cells"], Outcome]:
     """Integrate every cell of a problem together with a tangent.
 
     **Arguments:**
@@ -426,40 +410,37 @@ def growth(
     - `stretches`: number of time intervals; the growth is returned for each.
     - `settings`: their solver must be an explicit Runge-Kutta solver of Diffrax.
 
-    **Returns:** the `Growth`; nothing grows in a cell after its run has ended.
+    **Returns:** the logarithm of the growth in each interval, 0 after a run has ended; and the `Outcome`.
 
     **Example:** neighbouring runs of a decay approach each other.
 
     >>> from nonholonomic.derivatives import growth
-    >>> result = growth(Decays(jnp.array([1.0, 2.0])), jnp.ones((1, 2)), 8.0, 2, settings)
-    >>> print(result.logarithm.round(6))
+    >>> logarithm, outcome = growth(Decays(jnp.array([1.0, 2.0])), jnp.ones((1, 2)), 8.0, 2, settings)
+    >>> print(logarithm.round(6))
     [[-4. -8.]
      [-4. -8.]]
     """
     start, magnitudes = problem.start()
     size, cells = start.shape
     stretch, direction = jnp.asarray(t1 / stretches), tangents / magnitudes
-    logarithms, end_time, status = [], np.zeros(cells), np.full(cells, RUNNING)
-    steps, state = np.zeros(cells, int), np.asarray(start)
+    logarithms: list[Float[np.ndarray, " cells"]] = []
+    ending: Any = None
     with Progress(stretches, "stretch") as display:
         for number in range(stretches):
             unit = direction / jnp.linalg.norm(direction, axis=0)
             states = jnp.concatenate([start, unit, jnp.zeros((1, cells))])
             variational = VariedProblem(problem, states, magnitudes, number * stretch)
             outcome, _ = solve_ensemble(variational, stretch, jnp.asarray(cells), settings)
-            alive = (status == RUNNING) | (status == REACHED_END)
-            logarithms.append(np.where(alive, outcome.state[-1], 0.0))
-            end_time += np.where(alive, outcome.end_time, 0.0)
-            steps += np.where(alive, outcome.steps, 0)
-            status = np.where(alive, outcome.status, status)
-            start, direction = outcome.state[:size], outcome.state[size:-1]
-            state = np.where(alive, start, state)
+            start, direction, logarithm = outcome.state[:size], outcome.state[size:-1], outcome.state[-1]
+            outcome = outcome._replace(state=start)
+            alive, ending = (True, outcome) if number == 0 else continued(ending, outcome)
+            logarithms.append(np.where(alive, logarithm, 0.0))
             # The first interval compiles.
             if number == 0:
                 display.begin(1)
             else:
                 display.advance(1)
-    return Growth(np.stack(logarithms), status, end_time, state, steps)
+    return np.stack(logarithms), ending
 
 
 def exponent_of(
@@ -474,7 +455,7 @@ def exponent_of(
     motion. An exponent below twice its error is no sign of chaos. Where the motion stays near orderly motion for a long
     time, the error is up to four times too small (`tests/tippe/test_lyapunov.py`).
 
-    **Arguments:** `logarithm`: as in `Growth`, with a multiple of 8 intervals; `t1`: duration [s] of all intervals.
+    **Arguments:** `logarithm`: as from `growth`, with a multiple of 8 intervals; `t1`: duration [s] of all intervals.
 
     **Returns:** exponent and error [1/s].
 

@@ -2,7 +2,7 @@
 
 The runs are computed round by round, and some rounds are kept as checkpoints. The backward pass takes the rounds in
 reverse: the transpose of the saltation matrix carries the cotangents through every reset (`saltation.py`), and the adjoint of
-the motion carries them through the mode (`derivatives/sampled_runs.py`). The motion is repeated from its start for the
+the motion carries them through the mode (`derivatives/adjoint.py`). The motion is repeated from its start for the
 time that it lasted, so that no event is located again. The cost does not depend on the number of parameters where the reset
 map has a transpose; other reset maps are differentiated along every number of their mode. The memory is that of the
 samples, of the checkpoints, and of the adjoint of one mode.
@@ -11,7 +11,7 @@ samples, of the checkpoints, and of the adjoint of one mode.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,19 +20,10 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..compilation.xla_cpu import greatest, uncounted
-from ..derivatives import tangents_of
-from ..derivatives.adjoint import Checkpoints
-from ..derivatives.differentiable import Structure
-from ..derivatives.sampled_runs import (
-    AbstractSampling,
-    Horizon,
-    ProblemSpec,
-    SampledCotangents,
-    mixture,
-    samples_pulled_back,
-    solve_for_samples,
-)
+from ..compilation.xla_cpu import greatest
+from ..derivatives import SampledRun, tangents_of
+from ..derivatives.adjoint import SampledCotangents, mixture, samples_pulled_back, there_and_back
+from ..derivatives.sampled_runs import AbstractSampling, Options, solve_for_samples
 from ..derivatives.variation import Tangent, by_active, where_active, with_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
@@ -41,7 +32,6 @@ from .ensemble import (
     BETWEEN,
     MOST_ROUNDS,
     AbstractBatchedMode,
-    Advance,
     Carry,
     HybridOutcome,
     at_start,
@@ -55,9 +45,7 @@ from .ensemble import (
 from .saltation import VariationalMode, along, delay, variational_modes, variational_start
 from .samples import (
     Built,
-    HybridSamples,
     Recorded,
-    derivative,
     output_rows,
     reset_with_rows,
     sampled_rounds,
@@ -84,7 +72,7 @@ def hybrid_samples(
     t1: Float[Array, ""],
     settings: Settings,
     counters: int,
-) -> HybridSamples:
+) -> SampledRun:
     """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in
     step-size control. A batch under `vmap` is solved as one ensemble. The gradient of a function of its samples by many
     numbers takes one backward pass.
@@ -99,7 +87,7 @@ def hybrid_samples(
     - `settings`: settings with an explicit Runge-Kutta solver; their tolerance may be traced.
     - `counters`: number of counters, the rows of `Transition.counts`.
 
-    **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
+    **Returns:** a `SampledRun`; the output rows and the end time have derivatives, NaN after a grazing event.
 
     **Raises:** `ValueError` for derivatives with respect to the times, and for second derivatives.
 
@@ -111,7 +99,7 @@ def hybrid_samples(
     ...     start = jnp.array([[1.0], [0.0]])
     ...     return (Bounce(restitution),), jnp.zeros(cells, int), jnp.broadcast_to(start, (2, cells))
     >>> def height(restitution):
-    ...     return hybrid_samples(build, restitution, jnp.array([0.8]), jnp.asarray(1.0), settings, 1).shown[0, 0]
+    ...     return hybrid_samples(build, restitution, jnp.array([0.8]), jnp.asarray(1.0), settings, 1).states[0, 0]
     >>> slope, speed = jax.grad(height)(0.6), np.sqrt(2 * 9.81)
     >>> print(f"{slope:.6f} {speed * (0.8 - speed / 9.81):.6f}")
     1.543558 1.543558
@@ -139,23 +127,20 @@ def _refused(primals, tangents):
 class HybridSampling(AbstractSampling):
     """Samples of hybrid runs."""
 
-    movable: int
-    spec: ProblemSpec
-    places: Structure = eqx.field(static=True)
     counters: int = eqx.field(static=True)
 
-    def built(self, spec: ProblemSpec, numbers: tuple[Array, ...], cells: int | None) -> Built:
-        return spec.of(numbers, spec.settings.tolerance, cells)
+    def built(self, modules: PyTree, tolerance: Array, cells: int | None) -> Built:
+        return self.build(modules, tolerance, cells)
 
     def sampled(
-        self, built: Built, tangents: tuple[Tangent, ...], horizon: Horizon, spec: ProblemSpec, nested: bool
-    ) -> tuple[HybridSamples, list[HybridSamples]]:
+        self, built: Built, tangents: tuple[Tangent, ...], options: Options, nested: bool
+    ) -> tuple[SampledRun, list[SampledRun]]:
         if nested:
             raise ValueError(
                 "second derivatives are not available through changes of mode; take differences of a gradient instead"
             )
-        tangents, cells = tuple((tangent[0], tangent[2]) for tangent in tangents), built[2].shape[1]
-        return sampled_with_tangents(built, tangents, horizon, cells, spec.settings, self.counters)
+        tangents, settings = tuple((tangent[0], tangent[2]) for tangent in tangents), options[2]
+        return sampled_with_tangents(built, tangents, options[:2], built[2].shape[1], settings, self.counters)
 
     def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
         if len(active) <= MOST_FORWARD:
@@ -167,31 +152,31 @@ class HybridSampling(AbstractSampling):
             return False
         return True
 
-    def differentiable(self, primal: HybridSamples) -> HybridSamples:
-        return derivative(primal.shown, primal.end_time)
+    def differentiable(self, primal: SampledRun) -> SampledRun:
+        return SampledRun(primal.states, None, primal.end_time)
 
     def pull_back(
-        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: HybridSamples
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: SampledRun
     ) -> list[Lanes]:
         if cells == 1 and len(active) <= MOST_FORWARD_ALONE:
             slopes = self.value_and_tangents(active, False, cells, *leaves)[1]
             return [_product(slope, cotangents) for slope in slopes]
-        build, numbers, (times, t1), spec, _ = self.builder(cells, leaves)
+        build, numbers, (times, t1, settings, _), _ = self.builder(cells, leaves)
         rebuilt, point = by_active(build, active, numbers, cells)
         times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells))
-        shown, end_time = cotangents.shown, cotangents.end_time
+        shown, end_time = cotangents.states, cotangents.end_time
         if shown is None:
             modes, _, state = rebuilt(*point)
-            shown = jnp.zeros((cells, len(jax.eval_shape(modes[0].shown, state)), len(times)))
+            shown = jnp.zeros((cells, len(times), len(jax.eval_shape(modes[0].shown, state))))
         end_time = jnp.zeros(cells) if end_time is None else end_time
-        options = (times, jnp.broadcast_to(t1, (cells,)), spec.settings, self.counters)
-        return hybrid_samples_pulled_back(rebuilt, point, jnp.moveaxis(shown, 0, -1), end_time, *options)
+        options = (times, jnp.broadcast_to(t1, (cells,)), settings, self.counters)
+        return hybrid_samples_pulled_back(rebuilt, point, shown.T, end_time, *options)
 
 
-def _product(slope: HybridSamples, cotangents: HybridSamples) -> Lanes:
+def _product(slope: SampledRun, cotangents: SampledRun) -> Lanes:
     """The derivative of a sum over samples, from their derivatives and their cotangents; a derivative that is zero counts
     for nothing, whatever the cotangent."""
-    pairs = ((slope.shown, cotangents.shown), (slope.end_time, cotangents.end_time))
+    pairs = ((slope.states, cotangents.states), (slope.end_time, cotangents.end_time))
     terms = [weighted(one, other).reshape(len(one), -1) for one, other in pairs if other is not None]
     return sum((jnp.sum(term, axis=1) for term in terms), jnp.zeros(len(slope.end_time)))
 
@@ -238,9 +223,6 @@ class EndlessProblem(AbstractProblem):
     def field(self, time: Lanes, state: Components) -> States:
         return self.whole.field(time, state)
 
-    def event_function(self, state: States) -> None:
-        return None
-
     def domain_margin(self, time: Lanes, state: States) -> None:
         return None
 
@@ -263,28 +245,13 @@ class Costate(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What is kept of a round: the runs at its start, and at the ends of the modes before the resets; and whether the event
-    there was grazing."""
+    """What is kept of a round: the runs at its start, and at the ends of the modes before the resets; the status after the
+    round; and whether the event there was grazing."""
 
     before: HybridOutcome[Array]
     ended: HybridOutcome[Array]
+    status: Int[Array, " cells"]
     grazes: Bool[Array, " cells"]
-
-
-class Rounds(NamedTuple):
-    """State of the forward pass and of the backward pass over the rounds.
-
-    `frontier` holds the runs at the start of the round numbered `number`; `output` the samples so far and `owner` the rounds
-    that they belong to. The backward pass takes the round before number `limit` next. The checkpoints are `Kept`.
-    """
-
-    frontier: HybridOutcome[Array]
-    output: Recorded
-    owner: Int[Array, "times cells"]
-    number: Int[Array, ""]
-    limit: Int[Array, ""]
-    checkpoints: Checkpoints
-    costate: Costate
 
 
 def hybrid_samples_pulled_back(
@@ -320,14 +287,48 @@ def hybrid_samples_pulled_back(
     initial = output._replace(state=states[:, None], number=first[None], between=None)
     _, (rate,) = output_rows(variational, initial)
     shown = jnp.where((times <= 0.0) & (rate == 0.0), 0.0, shown)
-    passes = Passes(variational, groups, (solve, reset), (times, t1), settings, shown, end_time)
-    count, no_cells = jnp.zeros((), int), jnp.zeros(cells, bool)
+
+    def solved(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
+        runs, output = solve(numbers, carry[:2], active)
+        return runs, output, chosen(active, runs, carry[2])
+
+    def left(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
+        return (*reset(numbers, carry[:2], lost), carry[2])
+
+    # The samples so far, and the rounds that they belong to.
+    def forward(number: Int[Array, ""], before: HybridOutcome[Array], recorded: Carry) -> tuple[PyTree, Kept, Carry]:
+        output, owner = recorded
+        after, new_output, ended = one_round((before, output, before), groups, solved, left)
+        is_new = jnp.isnan(output.number) & ~jnp.isnan(new_output.number)
+        kept = Kept(before, ended, after.status, after.counts[-1] > before.counts[-1])
+        return after, kept, (new_output, jnp.where(is_new, number, owner))
+
+    def backward(number: Int[Array, ""], kept: Kept, recorded: Carry, costate: Costate) -> Costate:
+        (output, owner), running = recorded, kept.before.status == RUNNING
+        # The derivatives begin at the ends of the runs; a horizon does not move.
+        ends = running & ((kept.status != RUNNING) | (number == MOST_ROUNDS - 1))
+        by_end = jnp.where(kept.status == REACHED_END, 0.0, end_time)
+        costate = costate._replace(start_time=jnp.where(ends, by_end, costate.start_time))
+        for group in groups:
+            active = running & functools.reduce(jnp.logical_or, (kept.before.mode == number for number in group))
+            stage = _Stage(variational, group, kept, output, active & (owner == number), (times, t1), settings, shown)
+            lost = active & (kept.ended.status == LEFT_DOMAIN)
+            for mask, step in ((lost, stage.through_reset), (active, stage.through_motion)):
+                costate = jax.lax.cond(jnp.any(mask), step, lambda _, costate: costate, mask, costate)
+        return costate
+
+    no_cells = jnp.zeros(cells, bool)
     none = [[jnp.zeros((*jnp.shape(leaf)[:-1], cells)) for leaf in mode.active_numbers()[0]] for mode in variational]
-    costate = Costate(jnp.zeros_like(passes.primal(runs)[0]), jnp.zeros(cells), none, no_cells)
-    checkpoints, owner = Checkpoints.none(Kept(runs, runs, no_cells)), jnp.full(times.shape, -1)
-    run = Rounds(runs, output, owner, count, count + MOST_ROUNDS, checkpoints, costate)
-    run = jax.lax.while_loop(lambda run: uncounted(run.limit > 0, run.number), passes.there_and_back, run)
-    costate = run.costate
+    costate = Costate(jnp.zeros_like(state), jnp.zeros(cells), none, no_cells)
+    recorded, example = (output, jnp.full(times.shape, -1)), Kept(runs, runs, runs.status, no_cells)
+    costate = there_and_back(
+        (runs, example, recorded, costate),
+        MOST_ROUNDS,
+        lambda runs: jnp.any(runs.status == RUNNING),
+        lambda kept, recorded: jnp.asarray(True),
+        forward,
+        backward,
+    ).adjoint
 
     def numbers_and_start(*point: Float[Array, "... cells"]) -> PyTree:
         modes, _, state = build(*point)
@@ -339,101 +340,30 @@ def hybrid_samples_pulled_back(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Passes:
-    """The forward pass over the rounds, and the backward pass, which carries derivatives through them.
-
-    - `modes`: with a tangent that moves all numbers; `groups`, `advance`: as for `one_round`.
-    - `horizon`: times of the samples and ends of the runs [s]; `shown`, `end_time`: their cotangents.
-    """
-
-    modes: tuple[VariationalMode, ...]
-    groups: Sequence[Sequence[int]]
-    advance: tuple[Advance, Advance]
-    horizon: tuple[Float[Array, "times cells"], Lanes]
-    settings: Settings
-    shown: Float[Array, "shown times cells"]
-    end_time: Lanes
-
-    def there_and_back(self, run: Rounds) -> Rounds:
-        """Compute all rounds up to the one that the backward pass needs, and take back those with a checkpoint."""
-        is_first = run.limit == MOST_ROUNDS
-
-        def is_ahead(run: Rounds) -> Bool[Array, ""]:
-            return jnp.any(run.frontier.status == RUNNING) & (run.number < run.limit)
-
-        def is_kept(run: Rounds) -> Bool[Array, ""]:
-            return (run.checkpoints.depth > 0) & (run.checkpoints.latest()[0] == run.limit - 1)
-
-        run = jax.lax.while_loop(is_ahead, self.forward, run)
-        # At first, the derivatives begin at the ends of the runs; a horizon does not move.
-        by_end = jnp.where(run.frontier.status == REACHED_END, 0.0, self.end_time)
-        costate = run.costate._replace(start_time=jnp.where(is_first, by_end, run.costate.start_time))
-        run = run._replace(limit=jnp.minimum(run.limit, run.number), costate=costate)
-        run = jax.lax.while_loop(is_kept, self.backward, run)
-        number, kept, checkpoints = run.checkpoints.latest()
-        return run._replace(frontier=kept.before, number=number, checkpoints=checkpoints)
-
-    def forward(self, run: Rounds) -> Rounds:
-        """Compute the next round."""
-        solve, reset = self.advance
-
-        def solved(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
-            runs, output = solve(numbers, carry[:2], active)
-            return runs, output, chosen(active, runs, carry[2])
-
-        def left(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
-            return (*reset(numbers, carry[:2], lost), carry[2])
-
-        before = run.frontier
-        after, output, ended = one_round((before, run.output, before), self.groups, solved, left)
-        is_new = jnp.isnan(run.output.number) & ~jnp.isnan(output.number)
-        return run._replace(
-            frontier=after,
-            output=output,
-            owner=jnp.where(is_new, run.number, run.owner),
-            number=run.number + 1,
-            checkpoints=run.checkpoints.added(run.number, Kept(before, ended, after.counts[-1] > before.counts[-1])),
-        )
-
-    def backward(self, run: Rounds) -> Rounds:
-        """Carry the derivatives through the latest round."""
-        (number, kept, checkpoints), costate = run.checkpoints.latest(), run.costate
-        for group in self.groups:
-            active = functools.reduce(jnp.logical_or, (kept.before.mode == number for number in group))
-            active = active & (kept.before.status == RUNNING)
-            stage = _Stage(self, group, kept, run.output, active & (run.owner == number))
-            lost = active & (kept.ended.status == LEFT_DOMAIN)
-            for cells, step in ((lost, stage.through_reset), (active, stage.through_motion)):
-                costate = jax.lax.cond(jnp.any(cells), step, lambda _, costate: costate, cells, costate)
-        return run._replace(limit=number, checkpoints=checkpoints, costate=costate)
-
-    def primal(self, runs: HybridOutcome[Array]) -> tuple[States, Lanes]:
-        """The states of some runs, and the time since their modes began."""
-        state = self.modes[0].parts(runs.state)[0]
-        return state[:-1], state[-1]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
 class _Stage:
     """The backward pass through one round of the modes of a group.
 
-    `owned`: the samples of the round.
+    - `modes`: with a tangent that moves all numbers; `owned`: the samples of the round.
+    - `horizon`: times of the samples and ends of the runs [s]; `shown`: the cotangents of the samples.
     """
 
-    passes: Passes
+    modes: tuple[VariationalMode, ...]
     group: Sequence[int]
     kept: Kept
     output: Recorded
     owned: Bool[Array, "times cells"]
+    horizon: tuple[Float[Array, "times cells"], Lanes]
+    settings: Settings
+    shown: Float[Array, "shown times cells"]
 
     def through_reset(self, lost: Bool[Array, " cells"], costate: Costate) -> Costate:
         """Carry the derivatives from the start of the next mode to the end of the mode."""
-        (times, t1), cell = self.passes.horizon, selected_cells(lost)
+        (times, t1), cell = self.horizon, selected_cells(lost)
         numbers, _, build = self._mode(cell)
-        primal, duration = (part[..., cell] for part in self.passes.primal(self.kept.ended))
+        primal, duration = self._primal(self.kept.ended, cell)
         left = greatest(t1[cell] - self.kept.ended.end_time[cell], 0.0)
         by_state, by_time = jnp.where(lost, costate.state, 0.0), jnp.where(lost, costate.start_time, 0.0)
-        weights = jnp.where(self.owned & (self.output.number == BETWEEN), self.passes.shown, 0.0)
+        weights = jnp.where(self.owned & (self.output.number == BETWEEN), self.shown, 0.0)
 
         def share(primal: States, start_time: Lanes, *numbers: Array) -> Array:
             """The share of the later run in the sum; the reset moves with the event (`saltation.py`)."""
@@ -462,11 +392,12 @@ class _Stage:
 
     def through_motion(self, active: Bool[Array, " cells"], costate: Costate) -> Costate:
         """Carry the derivatives from the end of the mode to its start."""
-        (times, t1), cell, (before, ended, _) = self.passes.horizon, selected_cells(active), self.kept
+        (times, t1), cell, (before, ended, *_) = self.horizon, selected_cells(active), self.kept
         numbers, rates, build = self._mode(cell)
-        start, variation = (part[:-1, cell] for part in self.passes.modes[0].parts(before.state))
+        start, variation = (part[:-1, cell] for part in self.modes[0].parts(before.state))
         left = greatest(t1 - before.end_time, 0.0)
-        duration = jnp.where(active, jnp.where(ended.status == REACHED_END, left, self.passes.primal(ended)[1]), 0.0)
+        duration = jnp.where(ended.status == REACHED_END, left, self._primal(ended)[1])
+        duration = jnp.where(active, duration, 0.0)
         owned = self.owned & (self.output.number != BETWEEN)
         samples = jnp.where(owned, self.output.state[: len(start)], start[:, None])
 
@@ -482,7 +413,7 @@ class _Stage:
             return over_cells(of_cell, build(*numbers))(samples, start_time, elapsed)
 
         pull = jax.vjp(rows, samples, jnp.zeros_like(times), *numbers)[1]
-        by_samples, by_start_time, *by_numbers = pull(jnp.where(owned, self.passes.shown, 0.0))
+        by_samples, by_start_time, *by_numbers = pull(jnp.where(owned, self.shown, 0.0))
         by_samples, by_start_time = (jnp.where(owned, part, 0.0) for part in (by_samples, by_start_time))
         # Rounding may put a sample after the end of the mode.
         times_in_mode = times - before.end_time
@@ -494,7 +425,7 @@ class _Stage:
             SampledCotangents(jnp.transpose(by_samples, (2, 1, 0)), jnp.zeros_like(duration), at_end),
             times_in_mode,
             duration,
-            self.passes.settings,
+            self.settings,
             [variation, *rates],
         )
         by_numbers = [one + other for one, other in zip(by_numbers, by_problem, strict=True)]
@@ -504,11 +435,16 @@ class _Stage:
             numbers=self._added(costate.numbers, active, by_numbers),
         )
 
+    def _primal(self, runs: HybridOutcome[Array], cell: Any = ...) -> tuple[States, Lanes]:
+        """The states of some cells, and the time since their modes began."""
+        state = self.modes[0].parts(runs.state)[0]
+        return state[:-1, cell], state[-1, cell]
+
     def _mode(
         self, cell: Int[Array, " cells"]
     ) -> tuple[list[Float[Array, "... cells"]], list[Array], Callable[..., AbstractBatchedMode]]:
         """The moving numbers of the mode of some cells, their rates, and the mode as a function of the numbers."""
-        mode = of_cells(mode_numbered(self.passes.modes, self.group, self.kept.before.mode), cell)
+        mode = of_cells(mode_numbered(self.modes, self.group, self.kept.before.mode), cell)
         numbers, build = mode.active_numbers()
         numbers, rates = (
             [with_cells(leaf, len(cell)) for leaf in leaves] for leaves in (numbers, mode.directions()[0])

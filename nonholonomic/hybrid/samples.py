@@ -2,14 +2,14 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, greatest
-from ..derivatives import in_groups
+from ..derivatives import SampledRun, in_groups
 from ..integration import Lanes, Settings, States, solve_with_samples
 from ..integration.problem import LEFT_DOMAIN, REACHED_END
 from ..integration.scheduler import of_cells
@@ -245,38 +245,6 @@ def output_rows(
     return rows
 
 
-class HybridSamples(NamedTuple):
-    """Hybrid runs at given times, all floats.
-
-    - `shown`: the output rows, NaN after the end of the run; `number`: index of the mode at each time, or `BETWEEN`.
-    - `end_time`, `end_state`, `end_mode`: when, where and in which mode the run ended; `status`: the status code.
-    - `steps`, `rejected`, `extremes`: as in `HybridOutcome`; `counts`: the counters.
-
-    **Example:** as for `hybrid_samples`.
-
-    >>> from nonholonomic.hybrid import HybridSamples
-    >>> HybridSamples._fields[:3]
-    ('shown', 'number', 'end_time')
-    """
-
-    shown: Float[Array, "*cells shown times"]
-    number: Float[Array, "*cells times"]
-    end_time: Float[Array, "*cells"]
-    end_state: Float[Array, "*cells components"]
-    end_mode: Float[Array, "*cells"]
-    status: Float[Array, "*cells"]
-    steps: Float[Array, "*cells"]
-    rejected: Float[Array, "*cells"]
-    extremes: Float[Array, "*cells 3"]
-    counts: Float[Array, "*cells kinds"]
-
-
-def derivative(shown: Float[Array, "*cells shown times"], end_time: Float[Array, "*cells"]) -> HybridSamples:
-    """A derivative of `HybridSamples`, of which the other entries have none."""
-    none: Any = None
-    return HybridSamples(shown, none, end_time, *(none,) * 7)
-
-
 @compiled_alone
 def solve_hybrid_with_samples(
     modes: tuple[AbstractBatchedMode, ...],
@@ -289,7 +257,7 @@ def solve_hybrid_with_samples(
     *,
     counters: int,
     tangents: Tangents = (),
-) -> tuple[HybridSamples, list[HybridSamples]]:
+) -> tuple[SampledRun, list[SampledRun]]:
     """Run every cell through its modes to `t1`, or to where the model ends, and sample it.
 
     **Arguments:** as for `solve_hybrid`, and
@@ -297,15 +265,14 @@ def solve_hybrid_with_samples(
     - `times`: times of the samples [s], strictly increasing, at least 0; (times,) for all cells or (times, cells).
     - `tangents`: as for `solve_hybrid_with_tangents`.
 
-    **Returns:** `HybridSamples`, with the cells along the first axis, and their derivative along each tangent, in which
-    only `shown` and `end_time` are present.
+    **Returns:** a `SampledRun`, with the cells along the first axis, and its derivative along each tangent.
 
     **Example:** the heights of both balls at 0.8 s, after a bounce.
 
     >>> from nonholonomic.hybrid import solve_hybrid_with_samples
     >>> times = jnp.array([0.8])
     >>> samples, _ = solve_hybrid_with_samples(modes, first, start, times, 1.0, 2, settings, counters=1)
-    >>> print(samples.shown[:, 0, 0].round(6), samples.number[:, 0])
+    >>> print(samples.states[:, 0, 0].round(6), samples.number[:, 0])
     [0.330492 0.639204] [0. 0.]
     """
     built = (modes, jnp.asarray(mode), jnp.asarray(state))
@@ -319,13 +286,13 @@ def sampled_with_tangents(
     cells: Int[Array, ""] | int,
     settings: Settings,
     counters: int,
-) -> tuple[HybridSamples, list[HybridSamples]]:
+) -> tuple[SampledRun, list[SampledRun]]:
     """The runs, and their derivative along each tangent."""
     (modes, first, state), (times, t1) = built, horizon
     size, runs = state.shape
     times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), runs))
 
-    def run(group: Tangents) -> tuple[HybridSamples, list[HybridSamples]]:
+    def run(group: Tangents) -> tuple[SampledRun, list[SampledRun]]:
         variational = variational_modes(modes, group, settings.tolerance, False)
         start = at_start(first, variational_start(state, group), cells, counters + 1)
         rounds = sampled_rounds(variational, start, times, jnp.broadcast_to(t1, (runs,)), settings, 1 + len(group))
@@ -333,15 +300,16 @@ def sampled_with_tangents(
         rows, variations = output_rows(variational, output)
         grazes = ended.counts[-1] > 0
         invalid = jnp.where(times > output.grazing_time, jnp.nan, 0.0)
-        counters_and_codes = (ended.mode, ended.status, ended.steps, ended.rejected, ended.extremes, ended.counts[:-1])
-        parts = (rows, output.number, ended.end_time, ended.state[:size], *counters_and_codes)
-        samples = HybridSamples(*(jnp.moveaxis(part.astype(float), -1, 0) for part in parts))
+        counts = (ended.steps, ended.rejected, ended.extremes, output.number, ended.mode, ended.counts[:-1])
+        parts = (ended.end_time, ended.state[:size], ended.status, *counts)
+        others = (jnp.moveaxis(part.astype(float), -1, 0) for part in parts)
+        samples = SampledRun(rows.T, None, *others)
         slopes = []
         for k, variation in enumerate(variations):
             # The variation of the time follows that of the state; a horizon does not move.
             delay = jnp.where(grazes, jnp.nan, ended.state[(k + 1) * (size + 1) + size])
             delay = jnp.where(ended.status == REACHED_END, 0.0, delay)
-            slopes.append(derivative(jnp.moveaxis(variation + invalid, -1, 0), delay))
+            slopes.append(SampledRun((variation + invalid).T, None, delay))
         return samples, slopes
 
     return in_groups(run, tangents)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..compilation.cache import padded
 from ..geometry import inverse
@@ -463,19 +463,6 @@ def _nan_if_moved(primals, tangents):
     return state, rates if time_rates is None else rates + jnp.nan * jnp.sum(time_rates)
 
 
-class SampledSolution(NamedTuple):
-    """A run at given times: its states, NaN after its end; when and where it ended, and whether it left the model's
-    domain.
-    """
-
-    states: Float[Array, "components times"]
-    end_time: Float[Array, ""]
-    end_state: Float[Array, " components"]
-    lost: Bool[Array, ""]
-    accepted: Int[Array, ""]
-    rejected: Int[Array, ""]
-
-
 def sample(
     problem: AbstractProblem,
     times: Float[Array, " times"] | None,
@@ -484,7 +471,9 @@ def sample(
     *,
     grid: Float[Array, " steps"] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
-) -> SampledSolution:
+    ends_on_event: bool = False,
+    start: tuple[Float[Array, " components"], Float[Array, " components"]] | None = None,
+) -> tuple[Outcome, Float[Array, "components times"]]:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
     The domain margin is checked at the ends of steps, and the run ends where the margin is zero on the dense output.
@@ -492,43 +481,50 @@ def sample(
 
     **Arguments:** as for `follow`; `times`: increasing, in [0, t1], or `None` for the times of the grid; `grid`: the
     ends of the steps [s], from 0 to t1, for a solver without an error estimate; `adjoint`: how Diffrax differentiates,
-    by default in forward mode.
+    by default in forward mode; `ends_on_event`: whether the run also ends on the event of the problem; `start`: the initial
+    state and its magnitudes, by default those of the problem.
 
-    **Returns:** a `SampledSolution`.
+    **Returns:** the `Outcome`, and the states at the times, NaN after the end of the run.
 
     **Example:**
 
     >>> from nonholonomic.integration import sample
-    >>> print(sample(Decays(jnp.asarray(2.0)), jnp.array([0.5, 1.0]), jnp.asarray(1.0), settings).states.round(6))
+    >>> print(sample(Decays(jnp.asarray(2.0)), jnp.array([0.5, 1.0]), jnp.asarray(1.0), settings)[1].round(6))
     [[0.367879 0.135335]]
     """
-    state, scales = problem.start()
+    state, scales = problem.start() if start is None else start
     if (jumps := problem.jumps(jnp.zeros_like(t1), state)) is not None:
         state = _with_fixed_jumps(state, jumps.times)
-    margin = problem.margin_at_start(jnp.zeros_like(t1), state)
-    is_watched = margin is not None
-    # Diffrax detects only changes of the margin's sign, so a run that starts outside the domain must end at once.
-    at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0
-    t1 = jnp.where(at_once, 0.0, t1)
-    event = diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y), optimistix.Newton(1e-13, 1e-13))
+    conditions: dict[int, tuple[Callable[..., Lanes], Lanes]] = {}
+    if ends_on_event and (value := problem.event_function(state)) is not None:
+        conditions[CROSSED] = (lambda t, y, args, **_: args.event_function(y)), value
+    if (margin := problem.margin_at_start(jnp.zeros_like(t1), state)) is not None:
+        conditions[LEFT_DOMAIN] = (lambda t, y, args, **_: args.domain_margin(t, y)), margin
+    # Diffrax detects only changes of a condition's sign, so a run that starts with a negative one must end at once.
+    at_once = [value <= 0.0 for _, value in conditions.values()]
+    horizon, t1 = t1, jnp.where(functools.reduce(jnp.logical_or, at_once, jnp.asarray(False)), 0.0, t1)
+    event = diffrax.Event([condition for condition, _ in conditions.values()], optimistix.Newton(1e-13, 1e-13))
     if times is None:
         assert grid is not None
         times, save_at, max_points = grid, diffrax.SubSaveAt(t0=True, steps=True), grid.size - 1
     else:
         save_at, max_points = diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), settings.max_steps
     control = _control(problem, settings, state, scales, jnp.minimum(times, t1)) if grid is None else _GivenSteps(grid)
-    solver = settings.for_single_runs if is_watched else settings.for_steps_alone
-    options = {"max_steps": max_points, "event": event if is_watched else None}
+    solver = settings.for_single_runs if conditions else settings.for_steps_alone
+    options = {"max_steps": max_points, "event": event if conditions else None}
     options |= {"saveat": diffrax.SaveAt(subs=[save_at, diffrax.SubSaveAt(t1=True)])}
     options |= {"adjoint": diffrax.ForwardMode() if adjoint is None else adjoint}
     solution = _solved(problem, solver, (jnp.zeros_like(t1), t1, None), state, control, **options)
-    lost = at_once if solution.event_mask is None else at_once | solution.event_mask
     (_, ends), (states, ends_at) = saved(solution)
     end = ends[0]
     # NaN rather than infinite: an angle computed from infinite components would look like an angle.
     states = jnp.where(times <= end, states.T, jnp.nan)
-    counts = solution.stats
-    return SampledSolution(states, end, ends_at[0], lost, counts["num_accepted_steps"], counts["num_rejected_steps"])
+    status = jnp.where(end < horizon, FAILED, REACHED_END)
+    for code, occurred, at_start in zip(conditions, solution.event_mask or [], at_once, strict=True):
+        status = jnp.where(occurred | at_start, code, status)
+    time = jnp.where(status == CROSSED, end, jnp.inf)
+    accepted, rejected = solution.stats["num_accepted_steps"], solution.stats["num_rejected_steps"]
+    return Outcome(status, time, time, end, ends_at[0], accepted + rejected, rejected, jnp.asarray(NO_EXTREMES)), states
 
 
 # The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the ensemble solver.
@@ -551,35 +547,14 @@ def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: S
     >>> print(solve_by_diffrax(problem, jnp.asarray(5.0), settings).crossing_time.round(6))
     [0.693147 0.346574 0.173287]
     """
-    (states, scales), rtol = problem.start(), settings.tolerance
+    settings = dataclasses.replace(settings, max_steps=min(settings.max_steps, MOST_STEPS))
+
+    def solve_cell(problem: AbstractProblem, state: Array, scales: Array) -> Outcome:
+        return sample(problem, t1[None], t1, settings, ends_on_event=True, start=(state, scales))[0]
+
     lane_axes = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
-
-    def solve_cell(cell_problem: AbstractProblem, state: Array, scale: Array) -> Outcome:
-        conditions: dict[int, Callable[..., Lanes]] = {}
-        if problem.event_function(states) is not None:
-            conditions[CROSSED] = lambda t, y, args, **_: args.event_function(y)
-        if problem.domain_margin(states[0], states) is not None:
-            conditions[LEFT_DOMAIN] = lambda t, y, args, **_: args.domain_margin(t, y)
-        # Diffrax detects only changes of a condition's sign, so a cell that starts with a negative condition must end
-        # at once.
-        at_once = [condition(jnp.zeros(()), state, cell_problem) <= 0.0 for condition in conditions.values()]
-        ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
-        event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
-        options = {"max_steps": min(settings.max_steps, MOST_STEPS), "event": event if conditions else None}
-        control = diffrax.PIDController(rtol, settings.absolute * rtol * scale)
-        times = (0.0, jnp.where(ends_at_once, 0.0, t1), None)
-        solution = _solved(cell_problem, settings.for_single_runs, times, state, control, **options)
-        ends, finals = saved(solution)
-        end, final = ends[0], finals[0]
-        status = jnp.where(end >= t1, REACHED_END, FAILED)
-        for code, occurred, at_start in zip(conditions, solution.event_mask or [], at_once, strict=True):
-            status = jnp.where(occurred | at_start, code, status)
-        crossing_time = jnp.where(status == CROSSED, end, jnp.inf)
-        steps, rejected = solution.stats["num_steps"], solution.stats["num_rejected_steps"]
-        return Outcome(status, crossing_time, crossing_time, end, final, steps, rejected, jnp.array(NO_EXTREMES))
-
     axes = Outcome._make((0, 0, 0, 0, -1, 0, 0, -1))
-    return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, states, scales)
+    return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, *problem.start())
 
 
 # The implicit midpoint rule, whose energy balance closes to round-off on the P-form.

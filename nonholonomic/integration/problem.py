@@ -241,6 +241,10 @@ class AbstractDerivedProblem(AbstractProblem):
     def inner(self, state: States) -> Float[Array, "inner *lanes"]:
         """The state of the other problem."""
 
+    def clock(self, time: Lanes) -> Lanes:
+        """The time of the other problem."""
+        return time
+
     @property
     def direction_decides(self) -> bool:
         return self.problem.direction_decides
@@ -257,19 +261,19 @@ class AbstractDerivedProblem(AbstractProblem):
         return self.problem.event_function(self.inner(state)) if self.ends_on_event else None
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.problem.domain_margin(time, self.inner(state))
+        return self.problem.domain_margin(self.clock(time), self.inner(state))
 
     def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
         return self.problem.lost_at_start(self.inner(state))
 
     def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return self.problem.exact_margin(time, self.inner(state))
+        return self.problem.exact_margin(self.clock(time), self.inner(state))
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
-        return self.problem.margins(time, self.inner(state))
+        return self.problem.margins(self.clock(time), self.inner(state))
 
     def jumps(self, time: Lanes, state: States) -> Jumps | None:
-        return self.problem.jumps(time, self.inner(state))
+        return self.problem.jumps(self.clock(time), self.inner(state))
 
 
 class CoreProblem(AbstractDerivedProblem):

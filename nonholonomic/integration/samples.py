@@ -92,19 +92,31 @@ class SampleTimes(eqx.Module):
         return jnp.minimum(lane_state.cell, len(self.first) - 1)
 
 
-class AbstractSampleRecorder(Recorder):
-    """Collects the samples of every cell. Its records have `rows`, and `sample`, the index of each lane's next sample."""
+class SampleRecorder(Recorder):
+    """Lets steps end on the sample times of every cell, and collects the samples. The records have `rows`, and `sample`, the
+    index of each lane's next sample."""
 
     times: SampleTimes
+
+    # As many iterations as fit the caches with their record.
+    period: ClassVar[int] = 64
+
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Collected) -> PyTree:
+        accepted = jnp.ones(collected.sample.shape, bool)
+        return Record(accepted, collected.sample, self.empty_rows(self.period, lane_state))
+
+    def step(
+        self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, PyTree]:
+        arguments = (self.times, in_lanes, lane_state, record, iteration)
+        return recorded_step(*arguments, lambda new_lanes, _, sample: Rows(new_lanes.state, sample))
 
     def empty_rows(self, count: int, lane_state: LaneState) -> Rows:
         """Rows without samples."""
         state = jnp.zeros((count, *lane_state.state.shape), lane_state.state.dtype)
         return Rows(state, jnp.full((count, *lane_state.time.shape), len(self.times)))
 
-    def collect(
-        self, collected: Collected, record: "DenseRecord | Record", ended: LaneState, refilled: LaneState
-    ) -> Collected:
+    def collect(self, collected: Collected, record: PyTree, ended: LaneState, refilled: LaneState) -> Collected:
         cell, rows = self.times.cell_of(ended), record.rows
 
         def added(samples: Float[Array, "cells times ..."], values: Float[Array, "rows lanes ..."]) -> Array:
@@ -226,7 +238,7 @@ class DenseRecord(NamedTuple):
     filled: Int[Array, ""]
 
 
-class DenseSampleRecorder(AbstractSampleRecorder):
+class DenseSampleRecorder(SampleRecorder):
     """Collects the samples of every cell, which lie inside steps; `middle_weights`: of the pair, `AbstractTunedPair.middle`."""
 
     middle_weights: tuple[float, ...] = eqx.field(static=True)
@@ -294,37 +306,28 @@ class Record(NamedTuple):
     rows: PyTree
 
 
-class SampleRecorder(AbstractSampleRecorder):
-    """Lets steps end on the sample times of every cell, and collects the samples."""
-
-    # As many iterations as fit the caches with their record.
-    period: ClassVar[int] = 64
-
-    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Collected) -> Record:
-        accepted = jnp.ones(collected.sample.shape, bool)
-        return Record(accepted, collected.sample, self.empty_rows(self.period, lane_state))
-
-    def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: Record, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, Record]:
-        arguments = (self.times, in_lanes, lane_state, record, iteration)
-        return step_towards_sample(*arguments, lambda new_lanes, _, sample: Rows(new_lanes.state, sample))
-
-
-def step_towards_sample(
-    times: SampleTimes,
+def recorded_step(
+    times: SampleTimes | None,
     in_lanes: InLanes,
     lane_state: LaneState,
     record: Record,
     iteration: Int[Array, ""],
-    entry: Callable[[LaneState, Lanes, Integers], PyTree],
+    entry: Callable[..., PyTree],
 ) -> tuple[LaneState, Record]:
-    """Try a step in every lane that does not pass its next sample, and record it.
+    """Try a step in every lane that does not pass its next sample, if there are samples, and record it.
 
     **Arguments:** as for `Recorder.step`; `entry`: function of the lanes after the step, of the length that was tried [s], and
     of the index of the sample on which each step ended, or the number of samples, that returns what to keep.
     """
     problem, control, atol = in_lanes
+
+    def with_row(row: PyTree) -> PyTree:
+        return jax.tree.map(functools.partial(written_in_place, at=iteration), record.rows, row)
+
+    if times is None:
+        new_lanes = try_step(problem, control, atol, lane_state)
+        row = entry(new_lanes, length_to_try(problem, control, lane_state), None)
+        return new_lanes, record._replace(rows=with_row(row))
     next_time = times.time_of(record.sample, lane_state)
     control_to_target = control._replace(t1=jnp.minimum(next_time, control.t1))
     # Even lengths up to the sample or, if it comes first, to the jump.
@@ -343,8 +346,7 @@ def step_towards_sample(
     new_lanes = new_lanes._replace(status=jnp.where(goes_on, status, new_lanes.status))
     tried_length = length_to_try(problem, control_to_target, lane_state)
     is_sample = at_target & (new_lanes.time >= next_time)
-    row = entry(new_lanes, tried_length, jnp.where(is_sample, record.sample, len(times)))
-    rows = jax.tree.map(functools.partial(written_in_place, at=iteration), record.rows, row)
+    rows = with_row(entry(new_lanes, tried_length, jnp.where(is_sample, record.sample, len(times))))
     return new_lanes, Record(new_lanes.time > lane_state.time, record.sample + is_sample, rows)
 
 

@@ -1,6 +1,6 @@
 """The Lyapunov exponent of a run of any model: whether nearby runs diverge exponentially, and how fast."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
 from ..derivatives import exponent_of, growth
-from ..derivatives.variation import Growth
+from ..derivatives.variation import continued
 from ..hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
 from ..hybrid.ensemble import at_start
 from ..hybrid.saltation import VariationalMode, variational_start
-from ..integration import Outcome, Settings
-from ..integration.problem import REACHED_END, RUNNING, Status
+from ..integration import Settings
+from ..integration.problem import Status
 from ..terminal import status_line
 from ..validation import require_outside
 from .event import modes_of
@@ -134,27 +134,22 @@ def exponent_of_model(model: AbstractModel, t1: float, settings: Settings, shape
     cells = int(np.prod(shape, dtype=int))
     direction = model.direction(cells)
     if model.smooth:
-        growths = growth(model.problem(cells, model.comparable), direction, t1, STRETCHES, settings)
-        # The end of smooth runs, as an outcome without an event.
-        none, steps = jnp.full(growths.status.shape, jnp.inf), jnp.asarray(growths.steps)
-        ending = (jnp.asarray(growths.end_time), jnp.asarray(growths.state))
-        counts = (steps, jnp.zeros_like(steps), jnp.stack([none, *jnp.zeros((2, *none.shape))]))
-        ended: Any = Outcome(jnp.asarray(growths.status), none, none, *ending, *counts)
+        logarithm, ended = growth(model.problem(cells, model.comparable), direction, t1, STRETCHES, settings)
     else:
-        growths, ended = _through_modes(model, direction, t1, cells, settings)
-    status = np.asarray(_ended(model, ended, settings.tolerance))
-    exponent, error = exponent_of(growths.logarithm, t1)
+        logarithm, ended = _through_modes(model, direction, t1, cells, settings)
+    status = np.asarray(_ended(model, jax.tree.map(jnp.asarray, ended), settings.tolerance))
+    exponent, error = exponent_of(logarithm, t1)
     is_complete = status == Status.COMPLETED
     times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
-    elapsed = np.minimum(times[:, None], growths.end_time)
+    elapsed = np.minimum(times[:, None], ended.end_time)
     # A run of zero length has no divergence.
-    running = np.cumsum(growths.logarithm, axis=0) / np.where(elapsed > 0.0, elapsed, 1.0)
+    running = np.cumsum(logarithm, axis=0) / np.where(elapsed > 0.0, elapsed, 1.0)
     return LyapunovExponent(
         exponent=np.where(is_complete, exponent, np.nan).reshape(shape),
         error=np.where(is_complete, error, np.nan).reshape(shape),
         status=np.array([Status(code).word for code in status]).reshape(shape),
-        end_time=growths.end_time.reshape(shape),
-        steps=growths.steps.reshape(shape),
+        end_time=np.asarray(ended.end_time).reshape(shape),
+        steps=np.asarray(ended.steps).reshape(shape),
         times=times,
         running=running.reshape(STRETCHES, *shape),
     )
@@ -165,8 +160,8 @@ _ended = eqx.filter_jit(lambda model, outcome, tolerance: model.ended(outcome, t
 
 def _through_modes(
     model: AbstractModel, direction: Float[Array, "components cells"], t1: float, cells: int, settings: Settings
-) -> tuple[Growth, HybridOutcome]:
-    """The growth of a tangent through the modes of a model, and how the runs have ended."""
+) -> tuple[Float[np.ndarray, "stretches cells"], HybridOutcome[np.ndarray]]:
+    """The logarithm of the growth of a tangent through the modes of a model, and how the runs have ended."""
     modes, first, states = modes_of(model, cells, settings.tolerance, model.comparable)
     tangent = (tuple(jax.tree.map(lambda _: None, mode) for mode in modes), jnp.asarray(direction))
     variational = tuple(
@@ -181,20 +176,11 @@ def _through_modes(
         outcome = solve_hybrid(variational, mode, state, stretch, cells, settings, counters=count + 1, n_blocks=2)
         rescaled = _rescaled(modes, jnp.asarray(outcome.mode), jnp.asarray(outcome.state), size)
         logarithm, state = map(np.asarray, rescaled)
-        alive = (ending.status == RUNNING) | (ending.status == REACHED_END)
+        mode, counts = np.minimum(outcome.mode, len(modes) - 1), ending.counts + outcome.counts[:-1]
+        outcome = outcome._replace(crossing_time=ending.crossing_time, state=outcome.state[:size], counts=counts)
+        alive, ending = continued(ending, outcome)
         logarithms.append(np.where(alive, logarithm, 0.0))
-        mode = np.minimum(outcome.mode, len(modes) - 1)
-        extended = outcome._replace(
-            crossing_time=ending.crossing_time,
-            end_time=ending.end_time + outcome.end_time,
-            state=outcome.state[:size],
-            steps=ending.steps + outcome.steps,
-            rejected=ending.rejected + outcome.rejected,
-            counts=ending.counts + outcome.counts[:-1],
-        )
-        ending = HybridOutcome(*(np.where(alive, new, old) for new, old in zip(extended, ending, strict=True)))
-    growths = Growth(np.stack(logarithms), ending.status, ending.end_time, ending.state, ending.steps)
-    return growths, jax.tree.map(jnp.asarray, ending)
+    return np.stack(logarithms), ending
 
 
 @eqx.filter_jit

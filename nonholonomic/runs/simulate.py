@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..compilation.xla_cpu import compiled_alone, compiled_for_one
-from ..derivatives import sampled_run, sampled_run_by_diffrax
-from ..hybrid import HybridOutcome, HybridSamples, hybrid_samples, solve_hybrid_with_samples
+from ..derivatives import SampledRun, sampled_run
+from ..hybrid import HybridOutcome, hybrid_samples, solve_hybrid_with_samples
 from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
 from ..integration.problem import Status, legal_run, require_times
 from ..sweeps import Axis, Variable, axis
@@ -109,13 +109,16 @@ def mode_at(number: Float[Array, "..."]) -> Int[Array, "..."]:
     return jnp.where(jnp.isnan(number), -1, number).astype(int)
 
 
-def outcome_of(samples: HybridSamples) -> HybridOutcome[Array]:
+def outcome_of(samples: SampledRun) -> HybridOutcome[Array]:
     """How sampled runs, with the cells along the first axis, have ended."""
-    codes = (samples.status, samples.steps, samples.rejected, samples.end_mode)
-    status, steps, rejected, mode = (code.astype(int) for code in codes)
-    counts = (steps, rejected, samples.extremes.T, mode)
+    parts = (samples.status, samples.steps, samples.rejected)
+    status, steps, rejected = (jax.lax.stop_gradient(part).astype(int) for part in parts)
+    mode, counts = samples.end_mode, samples.counts
+    mode = jnp.zeros_like(status) if mode is None else mode.astype(int)
+    counts = jnp.zeros((0, len(mode)), int) if counts is None else counts.astype(int).T
     ending = (jnp.full_like(samples.end_time, jnp.inf), samples.end_time, samples.end_state.T)
-    return HybridOutcome(status, *ending, *counts, samples.counts.astype(int).T)
+    extremes = jax.lax.stop_gradient(samples.extremes).T
+    return HybridOutcome(status, *ending, steps, rejected, extremes, mode, counts)
 
 
 @eqx.filter_jit
@@ -123,13 +126,13 @@ def _read_samples(
     cells: AbstractModel,
     names: tuple[str, ...],
     times: Float[Array, " times"],
-    samples: HybridSamples,
+    samples: SampledRun,
     tolerance: Float[Array, ""],
 ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
     """The `Status` of runs of several modes, and the variables of the table."""
 
     def of_cell(model: AbstractModel, rows: Array, number: Array, end_time: Array) -> dict[str, Array]:
-        values = model.read(names, times, rows, mode_at(number))
+        values = model.read(names, times, rows.T, mode_at(number))
         is_reached = times <= end_time
         return {
             name: jnp.where(is_reached.reshape(-1, *(1,) * (value.ndim - 1)), value, jnp.nan)
@@ -138,7 +141,7 @@ def _read_samples(
 
     outcome = outcome_of(samples)
     axes = (_own_axis, 0, 0, 0)
-    values = eqx.filter_vmap(of_cell, in_axes=axes)(cells, samples.shown, samples.number, samples.end_time)
+    values = eqx.filter_vmap(of_cell, in_axes=axes)(cells, samples.states, samples.number, samples.end_time)
     ending = {"end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
     return cells.ended(outcome, tolerance), values | ending | dict(zip(cells.counters, outcome.counts, strict=True))
 
@@ -278,24 +281,15 @@ def sampled(
     - `grid`: the ends of the steps [s] of a solver without an error estimate; `adjoint`: how Diffrax differentiates.
     - The others as for `simulate`, legal.
     """
-    if not model.smooth:
-        samples = hybrid_samples(modes_of_run, (model, names), times, t1, settings, len(model.counters))
-        of_one_cell = jax.tree.map(lambda part: part[None], samples)
-        return SampledRows(samples.shown, None, mode_at(samples.number), outcome_of(of_one_cell))
-    if adjoint is None:
-        prepared, in_lanes = model.for_lanes()
-        run = sampled_run(problem_of_run, (prepared, names), times, t1, settings, grid, arrays_in_lanes=in_lanes)
+    if model.smooth:
+        prepared, in_lanes = model.for_lanes() if adjoint is None else (model, False)
+        options = {"adjoint": adjoint, "arrays_in_lanes": in_lanes}
+        run = sampled_run(problem_of_run, (prepared, names), times, t1, settings, grid, **options)
     else:
-        run = sampled_run_by_diffrax(problem_of_run((model, names), None), times, t1, settings, adjoint, grid)
-    status, accepted, rejected = (
-        jax.lax.stop_gradient(part).astype(int)[None] for part in (run.status, run.accepted, run.rejected)
-    )
-    ending = (jnp.full(1, jnp.inf), run.end_time[None], run.end_state[:, None])
-    none = jnp.zeros((0, 1), int)
-    counts = (accepted + rejected, rejected, jax.lax.stop_gradient(run.extremes)[:, None])
-    outcome = HybridOutcome(status, *ending, *counts, jnp.zeros_like(status), none)
+        run = hybrid_samples(modes_of_run, (model, names), times, t1, settings, len(model.counters))
+    outcome = outcome_of(jax.tree.map(lambda part: part[None], run))
     passive = None if run.quadratures is None else run.quadratures.T
-    return SampledRows(run.states.T, passive, None, outcome)
+    return SampledRows(run.states.T, passive, None if run.number is None else mode_at(run.number), outcome)
 
 
 def sampled_if_legal(

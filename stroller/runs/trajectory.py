@@ -302,10 +302,11 @@ def followed(spec: RideSpec) -> tuple[Steps, Stats]:
         path = follow(problem, float(t1), settings, dense=False)
         steps, counts = Steps(path.times, path.states), (path.accepted, path.rejected, not path.failed)
     else:
-        solution, ends = _sample(problem, None, t1, settings, grid=grid), np.asarray(grid)
-        mask = ends <= float(solution.end_time)
-        steps = Steps(ends[mask], np.asarray(solution.states)[:, mask])
-        counts = (int(solution.accepted), int(solution.rejected), bool(mask.all()))
+        (outcome, states), ends = _sample(problem, None, t1, settings, grid=grid), np.asarray(grid)
+        mask = ends <= float(outcome.end_time)
+        steps = Steps(ends[mask], np.asarray(states)[:, mask])
+        rejected = int(outcome.rejected)
+        counts = (int(outcome.steps) - rejected, rejected, bool(mask.all()))
     # Plain numbers would be constants of a program, and other values would compile another program.
     return steps, Stats(*map(jnp.asarray, counts))
 

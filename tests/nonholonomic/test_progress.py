@@ -5,7 +5,6 @@ import subprocess
 import sys
 import threading
 import time
-import types
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from importlib.machinery import ModuleSpec
@@ -18,7 +17,7 @@ from terminal import Terminal, left, watched, words
 
 from nonholonomic import terminal as progress_module
 from nonholonomic.derivatives import growth
-from nonholonomic.integration import Settings
+from nonholonomic.integration import Outcome, Settings
 from nonholonomic.integration.problem import REACHED_END
 from nonholonomic.sweeps import Variable, axis, sweep
 from nonholonomic.terminal import Progress, status_line
@@ -175,8 +174,8 @@ def test_an_exponent_says_how_many_stretches_are_done(monkeypatch):
 
     def ensemble_solve(problem, stretch, cells, settings):
         time.sleep(0.06)
-        ends = {"state": jnp.ones((5, 3)), "end_time": jnp.ones(3), "steps": jnp.ones(3, int)}
-        return types.SimpleNamespace(**ends, status=jnp.full(3, REACHED_END)), None
+        times, steps = jnp.ones((3, 3)), jnp.ones((2, 3), int)
+        return Outcome(jnp.full(3, REACHED_END), *times, jnp.ones((5, 3)), *steps, jnp.ones((3, 3))), None
 
     monkeypatch.setattr(sys.modules["nonholonomic.derivatives.variation"], "solve_ensemble", ensemble_solve)
     growth(Still(), jnp.ones((2, 3)), 1.0, 8, Settings(1e-6))

@@ -75,7 +75,7 @@ def build(point, tolerance, cells):
 
 def loss(point, tolerance=1e-11):
     run = hybrid_samples(build, tuple(point), TIMES, jnp.asarray(1.0), Settings(tolerance), 1)
-    heights, speeds = jnp.where(jnp.isnan(run.shown), 0.0, run.shown)
+    heights, speeds = jnp.where(jnp.isnan(run.states), 0.0, run.states).T
     return jnp.sum(heights**2 * jnp.cos(TIMES) + 0.1 * speeds) + run.end_time**2
 
 
@@ -107,7 +107,7 @@ def test_a_single_backward_pass_gives_the_derivatives_of_the_closed_form(monkeyp
         point, times = (restitution, gravity, height), jnp.array([0.0, 0.1, 1.2])
         run = hybrid_samples(bouncing, point, times, jnp.asarray(1.2), Settings(1e-6), 1)
         # Infinite at the start, where the speed does not depend on any number.
-        return run.shown[0, 2] + 0.0 * jnp.sqrt(run.shown[1, 0])
+        return run.states[2, 0] + 0.0 * jnp.sqrt(run.states[0, 1])
 
     point = (0.8, 9.81, 0.4)
     slopes = jax.grad(height, (0, 1, 2))(*point)

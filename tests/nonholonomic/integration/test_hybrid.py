@@ -229,7 +229,7 @@ def sampled(kind, times, tangents=()):
     state, first = np.stack([heights, 0.0 * heights, 0.0 * heights]), np.full(CELLS + PADDING, FALLING)
     options = (modes, first, state, jnp.asarray(times), 4.0, CELLS, SETTINGS)
     samples, slopes = solve_hybrid_with_samples(*options, counters=1, tangents=tangents)
-    return np.moveaxis(samples.shown[:CELLS], 0, -1), samples, slopes
+    return np.transpose(samples.states[:CELLS], (2, 1, 0)), samples, slopes
 
 
 class Hop(NamedTuple):
@@ -319,7 +319,7 @@ def test_the_slopes_of_many_balls_at_given_times(kind):
         [[min(abs(ball.bounce(k) - time) for k in range(1, 60)) > 1e-4 for time in times] for ball in BALLS]
     )
     assert away.mean() > 0.9
-    computed = np.moveaxis(np.asarray(slopes.shown[:CELLS, :2]), 1, 2)
+    computed = np.asarray(slopes.states[:CELLS, :, :2])
     assert_close(computed[away], expected[away], rtol=1e-4, atol=1e-5)
 
 

@@ -104,7 +104,7 @@ def test_no_run_of_a_batch_is_continued_in_a_mode_that_it_is_not_in():
         return hybrid_samples(turning, first, jnp.array([1.0]), jnp.asarray(1.0), Settings(1e-6), 1)
 
     samples = run(jnp.array([0.0, 1.0]))
-    assert_close(samples.shown[:, 2:, 0], [[np.cos(RATE), -np.sin(RATE)]] * 2, atol=1e-4)
+    assert_close(samples.states[:, 0, 2:], [[np.cos(RATE), -np.sin(RATE)]] * 2, atol=1e-4)
     assert_close(samples.counts[:, 0], [19, 19])
     # Twelve stages for each run in each step.
     assert EVALUATIONS["field"] < 3 * 12 * float(jnp.sum(samples.steps))
