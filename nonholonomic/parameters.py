@@ -270,7 +270,8 @@ class TreeForm:
         """The form of a tree, and its numbers."""
         numbers, static = eqx.partition(tree, is_number)
         leaves, structure = jax.tree.flatten(numbers)
-        arrays = [jnp.asarray(leaf) for leaf in leaves]
+        # With the type stated, one program serves Python's numbers and arrays.
+        arrays = [jnp.asarray(leaf, jnp.result_type(leaf)) for leaf in leaves]
         static_leaves, static_structure = jax.tree.flatten(static)
         kinds = tuple((array.shape, array.dtype) for array in arrays)
         return cls(structure, kinds, tuple(static_leaves), static_structure), spread(arrays)
