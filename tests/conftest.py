@@ -45,6 +45,18 @@ def pytest_configure(config: pytest.Config) -> None:
             os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 
+#: What a worker may need at most [bytes].
+MEMORY_OF_WORKER = 3_000_000_000
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One worker for each core, as far as the memory suffices. More than eight would mostly compile the same programs."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if hasattr(os, "sysconf"):
+        cores = min(cores, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // MEMORY_OF_WORKER)
+    return max(1, min(cores, 8))
+
+
 #: What a worker may hold after a module of tests [bytes] before it forgets its compiled programs; those that the next modules
 #: use too are read from the disk.
 MOST_MEMORY = 2_300_000_000
