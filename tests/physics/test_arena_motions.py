@@ -212,7 +212,8 @@ def test_derivatives_of_the_forces_by_ground_friction_and_launch():
         state = copies["scene"].state(copies["launch"])
         return jnp.append(copies["scene"].field(state), copies["scene"].normal_force(state))
 
-    numbers_of_law = tuple(NUMBERS.values())
+    # Arrays, for which there is one program whichever number is moved.
+    numbers_of_law = tuple(map(np.asarray, NUMBERS.values()))
     jacobian = np.stack(jax.jit(jax.jacfwd(forces, tuple(range(len(numbers_of_law)))))(*numbers_of_law))
     for k, value in enumerate(numbers_of_law):
 

@@ -102,23 +102,19 @@ def test_inputs_and_laws_with_arrays_are_evaluated_ride_by_ride(count):
     driver = Driver(jnp.linspace(0.0, 1.0, count), jnp.linspace(1.0, 3.0, count))
     speeds, launch = np.linspace(0.5, 2.0, 8), Launch((0.0, 0.0), 0.3, 1.0)
     axes, curve = {"launch.speed": speeds}, np.array([0.0, 1.0, 3.0])
+    of_curve = {"input.force[3]": [float(driver.force[3]), 4.0], "drags[1]": [0.5, 0.6]}
     tables = [
-        stroller.sweep(Scene(BODY, friction=law), launch, 1.0, input=driver, axes=axes, progress=False)
-        for law in (Damping(0.5), Curve(curve, 0.5 * curve))
+        stroller.sweep(Scene(BODY, friction=law), launch, 1.0, input=driver, axes=axes | more, progress=False)
+        for law, more in ((Damping(0.5), {}), (Curve(curve, 0.5 * curve), of_curve))
     ]
-    np.testing.assert_allclose(tables[1].end_speed, tables[0].end_speed, rtol=1e-12)
+    assert list(tables[1].coords) == ["speed", "force[3]", "drags[1]"]
+    np.testing.assert_allclose(tables[1].end_speed[:, 0, 0], tables[0].end_speed, rtol=1e-12)
+    assert np.all(np.diff(tables[1].end_speed, axis=1) > 0.0)
+    assert np.all(np.diff(tables[1].end_speed, axis=2) < 0.0)
     for k in (0, 7):
         ride = dataclasses.replace(launch, speed=speeds[k])
         run = stroller.simulate(Scene(BODY, friction=Damping(0.5)), ride, 1.0, driver, times=[1.0], tolerance=1e-11)
         np.testing.assert_allclose(tables[0].end_speed[k], run.speed[0], rtol=1e-8)
-    if count == 8:
-        axes = {"input.force[3]": [1.0, 2.0], "drags[1]": [0.5, 0.6]}
-        table = stroller.sweep(
-            Scene(BODY, friction=Curve(curve, 0.5 * curve)), launch, 1.0, input=driver, axes=axes, progress=False
-        )
-        assert list(table.coords) == ["force[3]", "drags[1]"]
-        assert np.all(np.diff(table.end_speed, axis=0) > 0.0)
-        assert np.all(np.diff(table.end_speed, axis=1) < 0.0)
 
 
 def test_a_sweep_without_axes_is_a_single_ride():
@@ -249,7 +245,8 @@ def test_main_job_refuses_bad_input(tmp_path, capsys):
 def test_a_table_of_another_input_does_not_resume(tmp_path):
     def ends(force):
         options = dict(axes={"launch.speed": [1.0, 1.5]}, path=tmp_path / "rides.h5", progress=False)
-        return stroller.sweep(BOWL, LAUNCH, 0.5, input=lambda t, motion: (force * jnp.cos(t), 0.0), **options).end_speed
+        options["input"] = lambda t, motion: (force * jnp.cos(t), 0.0)
+        return stroller.sweep(Scene(BODY), LAUNCH, 0.5, **options).end_speed
 
     speeds = ends(1.0)
     assert np.array_equal(ends(1.0), speeds)

@@ -116,7 +116,7 @@ def test_illegal_starts_in_a_batch_are_nan_and_illegal():
         return run["rate2"][-1], run
 
     columns = jnp.array([2.0, -2.0, 2.0]), jnp.array([0.0, 0.0, 1.0])
-    (ends, runs), slopes = jax.vmap(jax.value_and_grad(end, has_aux=True))(*columns)
+    (ends, runs), slopes = jax.jit(jax.vmap(jax.value_and_grad(end, has_aux=True)))(*columns)
     assert runs.status.tolist() == ["completed", "illegal", "illegal"]
     assert_close(ends[0], turn(0.2, TIME), 1e-8)
     assert np.isfinite(slopes[0])

@@ -57,7 +57,8 @@ def test_a_mass_is_lifted_off_a_table_in_a_table_and_in_a_batch():
     table = sweep(lifted(3.0), [0.0, 0.0], 5.0, axes={"modes[*].pull": PULLS})
     expected = G / PULLS + np.cbrt(6.0 / PULLS)
     assert_close(np.asarray(table["time"]), expected, atol=1e-8)
-    slopes = jax.vmap(jax.value_and_grad(lambda pull: event_time(lifted(pull), [0.0, 0.0], 5.0)))(PULLS[::6])
+    differentiated = jax.value_and_grad(lambda pull: event_time(lifted(pull), [0.0, 0.0], 5.0))
+    slopes = jax.jit(jax.vmap(differentiated))(PULLS[::6])
     assert_close(slopes[0], expected[::6], atol=1e-8)
     assert_close(slopes[1], -G / PULLS[::6] ** 2 - np.cbrt(6.0 / PULLS[::6]) / (3.0 * PULLS[::6]), atol=1e-6)
     ends = jax.vmap(lambda pull: simulate(lifted(pull), [0.0, 0.0], 4.0, times=[4.0]).state[0, 0])(PULLS)
@@ -117,7 +118,7 @@ def test_a_particle_slides_off_a_circle_whatever_the_times(tolerance):
 
         return jax.vmap(end)(starts)
 
-    for times in (jnp.array([3.0]), jnp.linspace(0.0, 3.0, 41)):
+    for times in (jnp.linspace(2.999, 3.0, 41), jnp.linspace(0.0, 3.0, 41)):
         places, switches = ends(times)
         assert_close(places, [fallen(angle, 3.0) for angle in angles], atol=20.0 * tolerance)
         assert switches.tolist() == [1] * 6
