@@ -96,7 +96,7 @@ def fitted():
 def test_a_long_call_says_what_it_does_and_leaves_nothing_behind(name, monkeypatch):
     call, module, function = CALLS[name]
     # A film needs a browser, which is never started here.
-    monkeypatch.setattr("nonholonomic.views.page.BROWSERS", (sys.executable,))
+    monkeypatch.setattr("nonholonomic.views.pages.BROWSERS", (sys.executable,))
     if module is not None:
         monkeypatch.setattr(importlib.import_module(module), function, waits)
     terminal = watched(monkeypatch)

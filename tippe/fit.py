@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.derivatives import differentiable_solve
 from nonholonomic.identification import (
     AbstractRecording,
     Free,
@@ -32,7 +33,7 @@ from nonholonomic.validation import as_number_or_none, is_traced, require_kind, 
 from .model.scene import Launch, Scene, as_launch
 from .runs.launches import angle_of, check_event, check_reversible, check_smooth, event_of, require_rigid
 from .runs.model import TopModel
-from .runs.verbs import beyond_horizon, time_of_inversion
+from .runs.verbs import ExtendedTime, beyond_horizon
 
 #: The words for data that can be fitted.
 EXPECTED = "an InversionTimes, a ReversalTimes or a Recording"
@@ -232,7 +233,7 @@ class InversionTimes(AbstractTimes):
         return TopModel.timed(system, self.launch, event_of(system, self.angle))
 
     def predicted(self, model: TopModel, t1: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
-        return time_of_inversion(model, t1, settings)
+        return differentiable_solve(*ExtendedTime.of(model, t1, settings, False))
 
     def of_ends(self, model: TopModel, t1: Cells, time: Cells, ends: dict[str, Float[Array, " cells"]]) -> Cells:
         angle = angle_of(model.scene, self.angle)

@@ -1,18 +1,18 @@
 """Pictures, films and pages of results. The subpackages above compute the results, and use these functions to draw
 them."""
 
-from .page import NO_VIEW as NO_VIEW
-from .page import Outputs as Outputs
-from .page import Page as Page
-from .page import Viewable as Viewable
-from .page import can_draw as can_draw
-from .page import page as page
-from .page import page_of_job as page_of_job
-from .page import picture_as_html as picture_as_html
-from .page import require_others as require_others
-from .page import run_job as run_job
-from .page import table_as_html as table_as_html
-from .page import without_motion as without_motion
+from .pages import NO_VIEW as NO_VIEW
+from .pages import Outputs as Outputs
+from .pages import Page as Page
+from .pages import Viewable as Viewable
+from .pages import can_draw as can_draw
+from .pages import page as page
+from .pages import page_of_job as page_of_job
+from .pages import picture_as_html as picture_as_html
+from .pages import require_others as require_others
+from .pages import run_job as run_job
+from .pages import table_as_html as table_as_html
+from .pages import without_motion as without_motion
 from .plot import draw_fit as draw_fit
 from .plot import draw_portrait as draw_portrait
 from .plot import draw_series as draw_series

@@ -76,18 +76,12 @@ ENDS = {
 TAKEN = (*ENDS, "contact_time", "end_time", "status", "steps", "rejected")
 
 
+@dataclasses.dataclass(frozen=True)
 class Original:
     """A user's input before it was traced, for files and for other processes. All are equal: the traced input decides
     whether a program is compiled again."""
 
-    def __init__(self, controls: Input):
-        self.input = controls
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Original)
-
-    def __hash__(self) -> int:
-        return 0
+    input: Input = dataclasses.field(compare=False)
 
 
 class RideModel(AbstractSceneModel):

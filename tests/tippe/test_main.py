@@ -75,7 +75,7 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
     assert "A tippe top on a table" in page
     assert "data:image/png" in page
     # The same again, without three.js: the tables are read, and the page says what is missing.
-    monkeypatch.setattr(importlib.import_module("nonholonomic.views.page"), "can_view", lambda: False)
+    monkeypatch.setattr(importlib.import_module("nonholonomic.views.pages"), "can_view", lambda: False)
     assert main(arguments) == 0
     assert capsys.readouterr().out.rstrip().endswith(NO_VIEW)
     page = (tmp_path / "index.html").read_text()

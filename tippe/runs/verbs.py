@@ -647,16 +647,11 @@ def extended_inversion_time(
     check_smooth(scene, "extended_inversion_time")
     # A fit may try parameters that are far off.
     settings = Settings(as_number(tolerance), max_steps=MOST_STEPS)
-    return time_of_inversion(TopModel.timed(scene, launch, as_number(angle)), t1, settings)
-
-
-def time_of_inversion(model: TopModel, t1: Number, settings: Settings) -> Float[Array, ""]:
-    """The extended time of a smooth model until its angle, for checked arguments."""
-    return differentiable_solve(*ExtendedTime.of(model, t1, settings, False))
+    return differentiable_solve(*ExtendedTime.of(TopModel.timed(scene, launch, as_number(angle)), t1, settings, False))
 
 
 class ExtendedTime(EventTime):
-    """Extended inversion times of cells."""
+    """Extended inversion times of cells, until the angle of a smooth model."""
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         # Every run has a time. A select on NaN would make the derivative of a failed run zero.

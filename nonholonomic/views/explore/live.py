@@ -19,7 +19,7 @@ from ...integration.problem import LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ...integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
 from ...integration.scheduler import LaneScheduler, back_to_margin, outcome_of, with_crossing_times
 from ...integration.step import Control, after_step, length_to_try, looks_of
-from ..page import Page, page, script, template
+from ..pages import Page, page, script, template
 from ..stage import Stage
 from .javascript import javascript
 

@@ -28,7 +28,7 @@ from nonholonomic.views import (
     page,
     turned,
 )
-from nonholonomic.views.page import Viewable
+from nonholonomic.views.pages import Viewable
 from nonholonomic.views.plot import draw_curves
 
 SURFACES = (
@@ -117,8 +117,8 @@ def played(driver, film: bytes, parts: list[float]) -> tuple[float, np.ndarray]:
 @needs_browser
 def test_a_film_plays_the_run_in_its_time(tmp_path, monkeypatch):
     """The ball has rolled half of its way after half of the film, however long each frame took to draw."""
-    monkeypatch.setattr("nonholonomic.views.page.WINDOW", (500, 700))
-    monkeypatch.setattr("nonholonomic.views.page.HEIGHT", 100)
+    monkeypatch.setattr("nonholonomic.views.pages.WINDOW", (500, 700))
+    monkeypatch.setattr("nonholonomic.views.pages.HEIGHT", 100)
     Rolling().animate(tmp_path / "ball.webm", speed=4.0, fps=20)
     film = (tmp_path / "ball.webm").read_bytes()
     with open_browser() as driver:
@@ -175,7 +175,7 @@ opener.open(sys.argv[-1] + {name!r}, data=b"no WebGL").close()
 def test_a_film_is_what_the_page_posts(name, tmp_path, monkeypatch):
     (tmp_path / "browser").write_text(BROWSER.format(python=sys.executable, name=name))
     (tmp_path / "browser").chmod(0o755)
-    monkeypatch.setattr("nonholonomic.views.page.BROWSERS", ("no-such-browser", str(tmp_path / "browser")))
+    monkeypatch.setattr("nonholonomic.views.pages.BROWSERS", ("no-such-browser", str(tmp_path / "browser")))
     message = {"error": "browser cannot record the page: no WebGL", "share": "browser ended with the status 0 before"}
     expected = pytest.raises(OSError, match=message[name]) if name in message else contextlib.nullcontext()
     with expected:
@@ -186,7 +186,7 @@ def test_a_film_is_what_the_page_posts(name, tmp_path, monkeypatch):
 
 
 def test_a_film_without_a_browser_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setattr("nonholonomic.views.page.BROWSERS", ())
+    monkeypatch.setattr("nonholonomic.views.pages.BROWSERS", ())
     monkeypatch.setattr(Rolling, "stages", lambda *_: pytest.fail("it was drawn"))
     with pytest.raises(FileNotFoundError, match=r"needs Chromium, Chrome or Edge.*apt install chromium.*Save film"):
         Rolling().animate(tmp_path / "ball.webm")
@@ -219,7 +219,7 @@ def test_curves_are_drawn_and_what_is_constant_is_flat():
 
 def test_a_view_has_the_unit_that_was_asked_for(tmp_path, monkeypatch):
     run = Rolling()
-    monkeypatch.setattr("nonholonomic.views.page.BROWSERS", (sys.executable,))
+    monkeypatch.setattr("nonholonomic.views.pages.BROWSERS", (sys.executable,))
     assert re.search(
         r'"label": "z \[cm\]", "values": \{"floats": \[\d+, \d+\]\}, "factor": 100\.0', run.view(unit="cm").html
     )

@@ -10,7 +10,7 @@ from browser import complaints, needs_browser, open_browser, wait
 import stroller
 import tippe
 from nonholonomic.views import COLOURS, css, page
-from nonholonomic.views.page import ANGLE
+from nonholonomic.views.pages import ANGLE
 from nonholonomic.views.stage import curves_in
 
 pytestmark = needs_browser
