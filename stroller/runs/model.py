@@ -476,7 +476,7 @@ def log_density(
 # Recorded rides of strollers, from arrays and from files.
 
 #: The quantities of a ride that can be recorded, with the names of a `Trajectory`'s properties.
-QUANTITIES = Quantities(
+RECORDED = Quantities(
     columns={"position": ("x", "y", "z")},
     units=dict.fromkeys(("x", "y", "z"), "m")
     | {"heading": "rad", "steering": "rad", "speed": "m/s", "yaw_rate": "rad/s", "steering_rate": "rad/s"},
@@ -519,7 +519,7 @@ class Recording(AbstractRecording):
     quantity: str | tuple[str, ...] = eqx.field(static=True, default="position", converter=as_quantity)
     input: Input | None = None
     jumps: Sequence[float] | Array | None = None
-    quantities: ClassVar[Quantities] = QUANTITIES
+    quantities: ClassVar[Quantities] = RECORDED
 
     def model(self, scene: object) -> AbstractModel:
         """The model of the recorded ride, checked."""
@@ -576,5 +576,5 @@ def read_recording(
     >>> print(ride.times, ride.value.round(2))
     [0. 1. 2.] [1.5  1.39 1.31]
     """
-    table = read_columns(path, columns, fps, error, QUANTITIES, decimal)
+    table = read_columns(path, columns, fps, error, RECORDED, decimal)
     return Recording(launch, *table, input=input, t0=t0, student=student, jumps=jumps)
