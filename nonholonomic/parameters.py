@@ -37,15 +37,13 @@ def numbers(root: str, tree: PyTree, functions: bool = True) -> dict[str, Any]:
     **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for an optional number
     that was omitted.
     """
-    values, tree = {}, _itself(tree)
+    values, tree = {}, tree.function if isinstance(tree, AbstractHeld) else tree
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
-        if isinstance(value, Numbers):
-            values |= dict(zip(_entries(name, value.shape), value.numbers, strict=True))
+        if parts := _parts(name, value):
+            values |= {entry: part for entry, part in parts.items() if is_number(part)}
         elif isinstance(value, eqx.Module):
             values |= numbers(name, value, functions) if functions or not callable(value) else {}
-        elif isinstance(value, tuple):
-            values |= {f"{name}[{k}]": part for k, part in enumerate(value) if is_number(part)}
         elif is_number(value) or (value is None and field.name in getattr(tree, "units", {})):
             values[name] = value
     return values
@@ -56,9 +54,11 @@ def numbers_of(roots: dict[str, PyTree]) -> dict[str, Any]:
     return {name: value for root, tree in roots.items() for name, value in numbers(root, tree).items()}
 
 
-def _itself(tree: PyTree) -> PyTree:
-    """The user's module itself for a module that is evaluated over lanes."""
-    return tree.function if isinstance(tree, AbstractHeld) else tree
+def _parts(name: str, value: Any) -> dict[str, Any]:
+    """The parts of a tuple or of an array of `Numbers`, by name; empty for any other value."""
+    if isinstance(value, Numbers):
+        return dict(zip(_entries(name, value.shape), value.numbers, strict=True))
+    return {f"{name}[{k}]": part for k, part in enumerate(value)} if isinstance(value, tuple) else {}
 
 
 def _entries(name: str, shape: tuple[int, ...]) -> list[str]:
@@ -204,15 +204,12 @@ def _replaced(name: str, tree: PyTree, values: Mapping[str, Any], were_checked: 
     changes = {}
     for field in dataclasses.fields(tree):
         path_of_field, value = f"{name}.{field.name}", getattr(tree, field.name)
+        parts = _parts(path_of_field, value)
         if path_of_field in values:
             changes[field.name] = values[path_of_field]
-        elif isinstance(value, Numbers):
-            entries = zip(_entries(path_of_field, value.shape), value.numbers, strict=True)
-            changes[field.name] = Numbers(tuple(values.get(entry, part) for entry, part in entries), value.shape)
-        elif isinstance(value, tuple):
-            parts = tuple(values.get(f"{path_of_field}[{k}]", part) for k, part in enumerate(value))
-            if any(f"{path_of_field}[{k}]" in values for k in range(len(value))):
-                changes[field.name] = parts
+        elif isinstance(value, Numbers) or not parts.keys().isdisjoint(values):
+            new = tuple(values.get(entry, part) for entry, part in parts.items())
+            changes[field.name] = Numbers(new, value.shape) if isinstance(value, Numbers) else new
         elif isinstance(value, eqx.Module) and any(path.startswith(path_of_field + ".") for path in values):
             changes[field.name] = _replaced(path_of_field, value, values, were_checked)
     if not changes or not were_checked or is_users(type(tree)):
@@ -228,7 +225,7 @@ def description(root: str, tree: PyTree) -> dict[str, Any]:
 
     A function is described by its name alone. Nothing in the data is different in another process.
     """
-    tree = _itself(tree)
+    tree = tree.function if isinstance(tree, AbstractHeld) else tree
     fields: dict[str, Any] = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
@@ -344,18 +341,17 @@ class Parameters(eqx.Module):
         try:
             return full_name(argument, name, self.known)
         except ValueError as error:
-            raise ValueError(f"{error}{self._undeclared(name)}") from None
-
-    def _undeclared(self, name: str) -> str:
-        """A hint for the name of an attribute that is an integer, or that has no type in its class."""
-        end = name.rsplit(".", 1)[-1]
+            message, end = str(error), name.rsplit(".", 1)[-1]
+        # The name may be that of an integer, or of an attribute that has no type in its class.
         for module in _modules(self.tree):
             value = getattr(module, end, None)
             if isinstance(value, int | float) and not isinstance(value, bool):
-                if end in {field.name for field in dataclasses.fields(module)}:
-                    return f"; {end} = {value} is an integer: write {float(value)}" if isinstance(value, int) else ""
-                return f"; declare it with its type in {type(module).__name__}: {end}: float = {float(value)}"
-        return ""
+                if end not in {field.name for field in dataclasses.fields(module)}:
+                    message += f"; declare it with its type in {type(module).__name__}: {end}: float = {float(value)}"
+                elif isinstance(value, int):
+                    message += f"; {end} = {value} is an integer: write {float(value)}"
+                break
+        raise ValueError(message)
 
 
 def of_all_modes(name: str) -> str:
@@ -373,26 +369,16 @@ def require_apart(argument: str, names: Iterable[str]) -> None:
 def short_names(names: list[str]) -> dict[str, str]:
     """For each full name, the part after its last dot, in the form `start_0`; if several names end alike, the whole
     name."""
-    ends = [_plain(name.rsplit(".", 1)[-1]) for name in names]
-    return {name: end if ends.count(end) == 1 else _plain(name) for name, end in zip(names, ends, strict=True)}
+    table = str.maketrans({"[": "_", "]": None, ".": "_"})
+    ends = [name.rpartition(".")[2] for name in names]
+    plain, ends = ([text.replace("[*]", "").translate(table) for text in texts] for texts in (names, ends))
+    return {name: end if ends.count(end) == 1 else text for name, text, end in zip(names, plain, ends, strict=True)}
 
 
-def _plain(name: str) -> str:
-    return name.replace("[*]", "").replace("[", "_").replace("]", "").replace(".", "_")
-
-
-def has_checks(tree: PyTree) -> bool:
-    """Whether a user's module checks its numbers, so that every value of an axis must be checked."""
-    kinds = {kind for module in _modules(tree) for kind in type(module).__mro__ if "__check_init__" in vars(kind)}
-    return any(not kind.__module__.startswith("nonholonomic.") for kind in kinds)
-
-
-def check_again(tree: PyTree) -> None:
-    """Check the numbers of all modules of a tree, as when they are created."""
-    for module in _modules(tree):
-        for kind in type(module).__mro__:
-            if "__check_init__" in vars(kind):
-                vars(kind)["__check_init__"](module)
+def checks_of(tree: PyTree) -> list[tuple[eqx.Module, type]]:
+    """The modules of a tree that check their numbers when they are created, each with every class that declares a check."""
+    modules = ((module, kind) for module in _modules(tree) for kind in type(module).__mro__)
+    return [(module, kind) for module, kind in modules if "__check_init__" in vars(kind)]
 
 
 def _modules(tree: PyTree) -> Iterator[eqx.Module]:

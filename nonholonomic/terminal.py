@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from types import TracebackType
-from typing import Any
+from typing import Any, ClassVar
 
 from .compilation.cache import forget_programs_if_many, is_off
 
@@ -33,6 +33,12 @@ class Progress:
     if standard error is neither a terminal nor a notebook's, or with `NONHOLONOMIC_PROGRESS=0`.
     """
 
+    #: The process has a single line, because it has one standard error: the calls that have something to show, the outermost
+    #: first, and the thread that writes the line.
+    _lock = threading.RLock()
+    _speakers: ClassVar[list["Progress"]] = []
+    _writer: ClassVar[threading.Thread | None] = None
+
     def __init__(self, total: int | None, unit: str = "", doing: str = "compiling", *, shown: bool = True):
         """Describe the work.
 
@@ -50,14 +56,14 @@ class Progress:
 
     def begin(self, done: int = 0) -> None:
         """Start counting; `done` items were done before."""
-        with _LINE.lock:
+        with self._lock:
             self._done = self._first = done
             self._since = time.time()
             self._clear()
 
     def advance(self, count: int, **notes: object) -> None:
         """Count `count` more items as done; `notes` are shown beside their number."""
-        with _LINE.lock:
+        with self._lock:
             self._done, self._notes = self._done + count, notes
             if self._bar is not None and self._since is not None:
                 self._bar.set_postfix(notes, refresh=False)
@@ -66,29 +72,29 @@ class Progress:
     @contextmanager
     def aside(self) -> Iterator[None]:
         """Remove the line while something else is written."""
-        with _LINE.lock:
+        with self._lock:
             self._clear()
             yield
 
     def __enter__(self) -> "Progress":
         self._caller, self._start = threading.get_ident(), time.time()
         if self._heard:
-            with _LINE.lock:
-                outer = [speaker for speaker in _LINE.speakers if speaker._caller == self._caller]
+            with self._lock:
+                outer = [speaker for speaker in self._speakers if speaker._caller == self._caller]
                 self._shown &= all(speaker._shown for speaker in outer)
                 self._inner = bool(outer)
                 if self._shown:
                     self._tqdm = bar_class()
-                _LINE.speakers.append(self)
-                if _LINE.writer is None or not _LINE.writer.is_alive():
-                    _LINE.writer = threading.Thread(target=_LINE.write, daemon=True)
-                    _LINE.writer.start()
+                self._speakers.append(self)
+                if Progress._writer is None or not Progress._writer.is_alive():
+                    Progress._writer = threading.Thread(target=Progress._write, daemon=True)
+                    Progress._writer.start()
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._heard:
-            with _LINE.lock:
-                _LINE.speakers.remove(self)
+            with self._lock:
+                self._speakers.remove(self)
                 if self._bar is not None:
                     self._bar.close()
                 self._bar = None
@@ -98,7 +104,12 @@ class Progress:
         if self._bar is not None and time.time() - self._written < INTERVAL:
             return
         self._written = time.time()
-        compiling = is_making_programs(self._caller)
+        # JAX does not report whether it is tracing or compiling in a thread. The check takes 0.5 ms, twice a second.
+        compiling, frame = False, sys._current_frames().get(self._caller)
+        while frame is not None and not compiling:
+            module, name = frame.f_globals.get("__name__"), frame.f_code.co_name
+            compiling = any(module == compiler and name.startswith(begin) for compiler, begin in COMPILERS)
+            frame = frame.f_back
         # Without a delay, tqdm writes the line before everything in it is known.
         options = {"delay": 1e-9, "leave": self._since is not None and not self._inner}
         if self._since is None:
@@ -116,36 +127,19 @@ class Progress:
             self._bar.set_description("compiling" if compiling else None, refresh=False)
         self._bar.refresh()
 
-    def _clear(self) -> None:
-        """Remove the line until it is written again."""
-        if self._bar is not None:
-            self._bar.leave = False
-            self._bar.close()
-        self._bar = None
-
-
-class _Line:
-    """The only status line of the process (there is one standard error), and the thread that writes it.
-
-    - `speakers`: the calls that have something to show, the outermost first.
-    """
-
-    def __init__(self):
-        self.lock, self.speakers = threading.RLock(), []
-        self.writer: threading.Thread | None = None
-
-    def write(self) -> None:
+    @classmethod
+    def _write(cls) -> None:
         """Write the line whenever it is due, until nothing has been shown for a while."""
         last = time.time()
         while True:
             time.sleep(TICK)
-            with self.lock:
-                if self.speakers:
+            with cls._lock:
+                if cls._speakers:
                     last = time.time()
                 elif time.time() - last > LINGER:
-                    self.writer = None
+                    Progress._writer = None
                     return
-                due = [line for line in self.speakers if line._shown and time.time() - line._start >= INTERVAL]
+                due = [line for line in cls._speakers if line._shown and time.time() - line._start >= INTERVAL]
                 owner = next((line for line in reversed(due) if line._total is not None), due[0] if due else None)
                 for line in due:
                     if line is not owner:
@@ -153,8 +147,12 @@ class _Line:
                 if owner is not None:
                     owner._show()
 
-
-_LINE = _Line()
+    def _clear(self) -> None:
+        """Remove the line until it is written again."""
+        if self._bar is not None:
+            self._bar.leave = False
+            self._bar.close()
+        self._bar = None
 
 
 @contextmanager
@@ -165,18 +163,6 @@ def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
     forget_programs_if_many()
     with Progress(None, doing=doing, shown=shown) as line:
         yield line
-
-
-def is_making_programs(thread: int) -> bool:
-    """Whether JAX is tracing or compiling in a thread, which JAX itself does not report. The check takes 0.5 ms, twice
-    a second."""
-    frame = sys._current_frames().get(thread)
-    while frame is not None:
-        module, name = frame.f_globals.get("__name__"), frame.f_code.co_name
-        if any(module == compiler and name.startswith(begin) for compiler, begin in COMPILERS):
-            return True
-        frame = frame.f_back
-    return False
 
 
 def is_watched() -> bool:

@@ -89,7 +89,7 @@ else:
 
 def as_number(value: object) -> Converted:
     """Convert to a floating-point array of the default precision; anything that is not a number stays unchanged, for
-    `require` to reject."""
+    `require` to reject, or because it is an omitted number, `None`."""
     try:
         # NumPy would read numbers from texts.
         for leaf in jax.tree.leaves(value):
@@ -98,11 +98,6 @@ def as_number(value: object) -> Converted:
         return jnp.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
         return value  # pyright: ignore[reportReturnType]
-
-
-def as_number_or_none(value: object) -> Converted | None:
-    """Like `as_number`, for an optional number."""
-    return None if value is None else as_number(value)
 
 
 def as_known(value: object) -> Converted:
@@ -465,19 +460,9 @@ class Bounded(eqx.Module, metaclass=Explaining):
         """A possible mistake in legal numbers, such as another unit, as text; `None` if there is none."""
 
     def __check_init__(self):
-        self._require_one_shape()
-        require_all(self.bounds())
-        # Copies that our threads make of the user's modules repeat no warning.
-        if (suspicion := self.suspicion()) is not None and _users_frame() is not None:
-            warn(suspicion)
-
-    def _require_one_shape(self) -> None:
-        """Raise `ValueError` if the module's own numbers are lists of different lengths, or empty. The arrays of a user's
-        class may have any shapes."""
-        if is_users(type(self)):
-            return
+        # The module's own numbers are scalars or lists of one length; the arrays of a user's class may have any shapes.
         shapes = {}
-        for field in dataclasses.fields(self):
+        for field in dataclasses.fields(self) if not is_users(type(self)) else ():
             for name, part in _parts(field.name, getattr(self, field.name)).items():
                 if isinstance(part, jax.Array | np.ndarray):
                     shapes[name] = np.shape(part)
@@ -491,6 +476,10 @@ class Bounded(eqx.Module, metaclass=Explaining):
                 f"{type(self).__name__}: {lists}: the numbers of one object must be scalars or lists of equal length; "
                 "for a grid of all combinations, use a table, such as inversion_table"
             ) from None
+        require_all(self.bounds())
+        # Copies that our threads make of the user's modules repeat no warning.
+        if (suspicion := self.suspicion()) is not None and _users_frame() is not None:
+            warn(suspicion)
 
     @property
     def _has_units(self) -> bool:

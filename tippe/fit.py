@@ -28,7 +28,7 @@ from nonholonomic.parameters import numbers
 from nonholonomic.runs.identify import AbstractEventTimes, Cells, Data, Prior, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel
 from nonholonomic.text import distinguishing_labels
-from nonholonomic.validation import as_number_or_none, is_traced, require_kind, require_scalars, warn
+from nonholonomic.validation import as_number, is_traced, require_kind, require_scalars, warn
 
 from .model.scene import Launch, Scene, as_launch
 from .runs.launches import angle_of, check_event, check_reversible, check_smooth, event_of, require_rigid
@@ -155,7 +155,7 @@ class AbstractTimes(AbstractEventTimes):
     """Measured times of an event of launches; see `InversionTimes`."""
 
     launch: Launch = eqx.field(converter=as_launch)
-    until: Float[Array, "..."] | None = eqx.field(converter=as_number_or_none, default=None)
+    until: Float[Array, "..."] | None = eqx.field(converter=as_number, default=None)
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, " or a list of launches")
@@ -215,8 +215,8 @@ class InversionTimes(AbstractTimes):
     [False, True, True]
     """
 
-    angle: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    angle: Float[Array, ""] | None = eqx.field(converter=as_number, default=None)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number, default=None)
     units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s", "angle": "rad"}
 
     def __check_init__(self):
@@ -261,7 +261,7 @@ class ReversalTimes(AbstractTimes):
     [False, False, False, True]
     """
 
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number, default=None)
     units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s"}
 
     def model(self, system: object) -> TopModel:

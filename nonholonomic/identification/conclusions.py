@@ -4,9 +4,9 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from .exploration import FARTHEST, ROWS, Explorer, Mixture, Weighted, fitted, squared_distances, weighted_covariance
+from .exploration import FARTHEST, ROWS, Explorer, Pool, fitted, squared_distances, weighted_covariance
 from .likelihood import Measurements
 from .posterior import Coordinates, Matrix, PerPoint, Points, Problem, deviances, predictions
 from .search import SAME, Minima, minimise
@@ -88,7 +88,7 @@ class Verdict(NamedTuple):
 def judge(
     ends: Minima,
     explorer: Explorer,
-    sample: Weighted,
+    sample: Pool,
     distribution: "Distribution",
     undetermined: tuple[str, ...],
     status: str,
@@ -102,11 +102,12 @@ def judge(
     """
     from scipy.stats import chi2
 
-    measurements, by_slopes, concerns = ends.measurements, ends.covariance(ends.best), []
+    measurements, by_slopes = ends.measurements, ends.covariance(ends.best)
     prediction, residual = ends.linearised.prediction[ends.best], ends.linearised.residual[ends.best]
     exact = ~np.asarray(measurements.censored)
-    limits = np.abs(residual[: len(exact)][~exact])
-    degrees = len(residual) - len(by_slopes) - len(limits)
+    missing = int(np.sum(~np.isfinite(prediction[exact])))
+    violated = int(np.sum(np.abs(residual[: len(exact)][~exact]) > FAR))
+    degrees = len(residual) - len(by_slopes) - int(np.sum(~exact))
     scores = normal_scores(measurements, prediction)
     chi_squared, p_value = float(np.sum(scores[exact] ** 2)), math.nan
     if degrees > 0 and not np.any(np.asarray(measurements.estimated)):
@@ -116,55 +117,70 @@ def judge(
     orders = [runs_of_signs(part) for part in parts]
     p_values = [order.p_value for order, part in zip(orders, parts, strict=True) if np.any(np.abs(part) > NEGLIGIBLE)]
     p_trend = min(p_values, default=1.0) * max(len(p_values), 1)
-    minima, further, notes = (), *without_prediction(explorer, sample, distribution)
-    region, names = explorer.region, explorer.density.problem.names
+    region = explorer.region
     is_outside = np.abs(distribution.estimate - region.middle) > region.half_width
-    if np.any(is_outside):
-        outside = ", ".join(name for name, is_out in zip(names, is_outside, strict=True) if is_out)
-        notes = (
-            f"{outside}: outside of the range in which minima were searched, so better ones may be missing; start closer, or "
-            "state a prior",
-            *notes,
-        )
+    outside = ", ".join(np.array(explorer.density.problem.names)[is_outside])
+    impossible, share = without_prediction(explorer, sample, distribution)
+    minima, concerns, notes = (), (), ()
     if distribution.kind == "weights":
-        minima, (others, more) = minima_of(explorer, sample), remarks(explorer, sample, distribution, by_slopes)
-        further, notes = (*further, *others), (*notes, *more)
-    if status != "converged":
-        concerns.append("the fit has not converged: allow more steps (max_steps), or start closer")
-    if distribution.kind == "none":
-        concerns.append(
-            f"there are no errors and intervals: the exploration ended with {sample.effective:.0f} effective draws "
-            f"(k-hat {sample.k:.2f}); start closer, give bounds or priors, or fix numbers"
-        )
-    if len(minima) > 1:
-        concerns.append(f"the data allow {len(minima)} minima: " + "; ".join(map(str, minima)))
-    if not np.all(np.isfinite(prediction[exact])):
-        missing = int(np.sum(~np.isfinite(prediction[exact])))
-        concerns.append(f"the model has no prediction for {missing} measurements: its run ends earlier, or fails")
-    if p_value < POOR:
-        concerns.append(
-            f"the residuals are too large (p = {p_value:.2g}): the model is wrong, the errors are too small, "
-            "or this is not the best minimum"
-        )
-    if np.any(limits > FAR):
-        concerns.append(f"{int(np.sum(limits > FAR))} limits are violated by more than {FAR:.0f} errors")
-    if p_trend < POOR:
-        concerns.append(
-            f"the residuals keep their sign for too long (p = {p_trend:.2g}): the model misses a trend, or "
-            "errors are correlated"
-        )
+        minima, (concerns, notes) = minima_of(explorer, sample), remarks(explorer, sample, distribution, by_slopes)
+    concerns = (
+        *sentences(
+            (status != "converged", "the fit has not converged: allow more steps (max_steps), or start closer"),
+            (
+                distribution.kind == "none",
+                f"there are no errors and intervals: the exploration ended with {sample.effective:.0f} effective draws "
+                f"(k-hat {sample.k:.2f}); start closer, give bounds or priors, or fix numbers",
+            ),
+            (len(minima) > 1, f"the data allow {len(minima)} minima: " + "; ".join(map(str, minima))),
+            (missing, f"the model has no prediction for {missing} measurements: its run ends earlier, or fails"),
+            (
+                p_value < POOR,
+                f"the residuals are too large (p = {p_value:.2g}): the model is wrong, the errors are too small, "
+                "or this is not the best minimum",
+            ),
+            (violated, f"{violated} limits are violated by more than {FAR:.0f} errors"),
+            (
+                p_trend < POOR,
+                f"the residuals keep their sign for too long (p = {p_trend:.2g}): the model misses a trend, or "
+                "errors are correlated",
+            ),
+            (
+                share > CUT,
+                f"{impossible}; of those beside the estimate, {100.0 * share:.0f} %: simulate a run there to see why",
+            ),
+        ),
+        *concerns,
+        *(f"the data do not determine {words}" for words in undetermined),
+    )
+    notes = (
+        *sentences(
+            (
+                outside,
+                f"{outside}: outside of the range in which minima were searched, so better ones may be missing; start closer, "
+                "or state a prior",
+            ),
+            (impossible and share <= CUT, impossible),
+        ),
+        *notes,
+    )
     return Verdict(
         p_value=p_value,
         series=tuple(order for order in orders if order.count > 1),
         agree=ends.agree,
         starts=len(ends.starts),
         undetermined=undetermined,
-        concerns=(*concerns, *further, *(f"the data do not determine {words}" for words in undetermined)),
+        concerns=concerns,
         notes=notes,
         effective=sample.effective,
         k=sample.k,
         minima=minima,
     )
+
+
+def sentences(*table: tuple[object, str]) -> tuple[str, ...]:
+    """The sentences whose conditions hold."""
+    return tuple(sentence for condition, sentence in table if condition)
 
 
 def normal_scores(measurements: Measurements, prediction: PerPoint) -> PerPoint:
@@ -184,7 +200,7 @@ def runs_of_signs(values: PerPoint) -> Series:
     If the numbers of positive and negative values are given, the number of runs of one sign has a hypergeometric
     distribution; the probability is summed exactly.
     """
-    from scipy.special import gammaln
+    from scipy.special import betaln
 
     signs = np.sign(values[np.isfinite(values) & (values != 0.0)])
     positive, negative = int(np.sum(signs > 0.0)), int(np.sum(signs < 0.0))
@@ -193,21 +209,15 @@ def runs_of_signs(values: PerPoint) -> Series:
         # All of one sign: as improbable as a coin that always shows the same side.
         return Series(len(signs), runs, min(1.0, 2.0 ** (1 - len(signs))) if len(signs) else 1.0)
 
-    def log_choose(n: int, k: np.ndarray) -> np.ndarray:
-        is_valid = (k >= 0) & (k <= n)
-        k_valid = np.where(is_valid, k, 0)
-        return np.where(is_valid, gammaln(n + 1.0) - gammaln(k_valid + 1.0) - gammaln(n - k_valid + 1.0), -np.inf)
-
     # For r runs, the positive signs are cut into r // 2 runs and the negative ones into r - r // 2, or the other way
     # round.
     counts = np.arange(2, runs + 1)
-    few_cuts, many_cuts = counts // 2 - 1, counts - counts // 2 - 1
-    total = log_choose(positive + negative, np.array(positive))
-    ways = [
-        log_choose(a - 1, few_cuts) + log_choose(b - 1, many_cuts)
-        for a, b in ((positive, negative), (negative, positive))
-    ]
-    return Series(len(signs), runs, min(1.0, float(np.sum(np.exp(np.array(ways) - total)))))
+    cuts, logs = (counts // 2 - 1, counts - counts // 2 - 1), []
+    for few, many in (cuts, cuts[::-1]):
+        # The logarithms of numbers of combinations, but for factors that cancel.
+        logs.append(-betaln(positive - few, few + 1.0) - betaln(negative - many, many + 1.0))
+    total = np.log(positive * negative / (positive + negative + 1.0)) - betaln(positive + 1.0, negative + 1.0)
+    return Series(len(signs), runs, min(1.0, float(np.sum(np.exp(np.array(logs) - total)))))
 
 
 # Profile likelihoods, by batches of runs and by least squares.
@@ -234,43 +244,28 @@ class Profile(NamedTuple):
         """Where to start again, if the profile falls below the best fit; otherwise empty. **Arguments:** `name`: name of the
         parameter."""
         best = int(np.argmin(self.deviance))
-        if self.deviance[best] >= -SAME:
-            return ""
-        return f"the fit is better with {name} = {self.values[best]:.6g}: start there"
+        return (
+            f"the fit is better with {name} = {self.values[best]:.6g}: start there"
+            if self.deviance[best] < -SAME
+            else ""
+        )
 
 
 def profiled(fit: "Identification", k: int, values: Float[np.ndarray, " points"]) -> Profile:
-    """The profile likelihood of the unknown with index `k`."""
-    problem = fit.problem
-    held = np.asarray(problem.unknowns[k].coordinate(values))
-    coordinates, deviance = _searched(fit, k, held)
-    converged = np.isfinite(deviance)
-    if len(problem.names) > 1:
-        ends = minimise(problem, coordinates, fit.measurements, fixed=k)
-        at_ends, converged = ends.linearised.deviance, ends.converged
-        improves = np.isfinite(at_ends) & (at_ends <= deviance)
-        coordinates = np.where(improves[:, None], ends.coordinates, coordinates)
-        deviance = np.where(improves, at_ends, deviance)
-    optima = problem.values(coordinates)
-    others = {other: optima[:, i] for i, other in enumerate(problem.names) if i != k}
-    return Profile(values, deviance - fit.deviance, others, converged)
+    """The profile likelihood of the unknown with index `k`.
 
-
-def _searched(
-    fit: "Identification", k: int, held: Float[np.ndarray, " points"]
-) -> tuple[Float[np.ndarray, "points unknowns"], Float[np.ndarray, " points"]]:
-    """The best coordinates for every held value, and -2 log likelihood there, by batches of runs without slopes.
-
-    The other coordinates are drawn around their regression on the held one, then around the best of the points so far.
+    For every held value, the other coordinates are drawn around their regression on the held one, then around the best of
+    the points so far, in batches of runs without slopes; least squares refine the best ones.
     """
-    estimate = fit.coordinates
+    problem, estimate = fit.problem, fit.coordinates
+    held = np.asarray(problem.unknowns[k].coordinate(values))
     covariance = np.where(np.isfinite(fit.coordinate_covariance), fit.coordinate_covariance, 0.0)
     random, size, points = np.random.default_rng(0), len(estimate), len(held)
     others = np.arange(size) != k
     slope = covariance[others, k] / covariance[k, k] if covariance[k, k] > 0.0 else np.zeros(size - 1)
     conditional = covariance[np.ix_(others, others)] - np.outer(slope, covariance[k, others])
-    values, vectors = np.linalg.eigh(conditional) if size > 1 else (np.zeros(0), np.zeros((0, 0)))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    variances, vectors = np.linalg.eigh(conditional) if size > 1 else (np.zeros(0), np.zeros((0, 0)))
+    root = vectors * np.sqrt(np.maximum(variances, 0.0))
     best = np.tile(estimate, (points, 1))
     best[:, k] = held
     best[:, others] += (held - estimate[k])[:, None] * slope
@@ -279,17 +274,25 @@ def _searched(
     least = np.full(points, np.inf)
     for batch in range(batches):
         trial = np.repeat(best[:, None], each, axis=1)
-        noise = NARROWER**batch * random.normal(size=(points, each, size - 1)) @ root.T
-        trial[..., others] += noise
+        trial[..., others] += NARROWER**batch * random.normal(size=(points, each, size - 1)) @ root.T
         trial[:, 0] = best
         rows = trial.reshape(-1, size)
-        deviance = deviances(fit.problem, rows, predictions(fit.problem, rows), fit.measurements)
+        deviance = deviances(problem, rows, predictions(problem, rows), fit.measurements)
         deviance = np.where(np.isfinite(deviance), deviance, np.inf).reshape(points, each)
         place = np.argmin(deviance, axis=1)
         improved = deviance[np.arange(points), place]
         best = np.where((improved < least)[:, None], trial[np.arange(points), place], best)
         least = np.minimum(least, improved)
-    return best, least
+    converged = np.isfinite(least)
+    if size > 1:
+        ends = minimise(problem, best, fit.measurements, fixed=k)
+        at_ends, converged = ends.linearised.deviance, ends.converged
+        improves = np.isfinite(at_ends) & (at_ends <= least)
+        best = np.where(improves[:, None], ends.coordinates, best)
+        least = np.where(improves, at_ends, least)
+    optima = problem.values(best)
+    estimates = {other: optima[:, i] for i, other in enumerate(problem.names) if i != k}
+    return Profile(values, least - fit.deviance, estimates, converged)
 
 
 # What a fit concludes about its parameters: estimate, errors and intervals, from the likelihood itself.
@@ -320,28 +323,24 @@ class Distribution(NamedTuple):
     weights: PerPoint
 
     @classmethod
-    def of(cls, best: Coordinates, by_slopes: Matrix, sample: Weighted) -> "Distribution":
+    def of(cls, best: Coordinates, by_slopes: Matrix, sample: Pool) -> "Distribution":
         """The distribution for the most likely coordinates, their covariance by slopes, and a weighted sample."""
-        points, weights = sample.pool.points, sample.weights
+        points, weights = sample.points, sample.weights
         if not np.all(np.isfinite(by_slopes)):
             return cls("slopes", best, by_slopes, points, weights)
         if not sample.enough:
             return cls("none", best, np.full_like(by_slopes, np.nan), points, weights)
-        squares = np.sum(np.linalg.solve(np.linalg.cholesky(by_slopes), (points - best).T) ** 2, axis=0)
         used = weights > 0.0
-        excess = sample.pool.log_density[used] + 0.5 * squares[used]
+        squares, _ = squared_distances(points[used], best, np.linalg.cholesky(by_slopes))
+        excess = sample.log_density[used] + 0.5 * squares
         mean_excess = weights[used] @ excess
         if math.sqrt(weights[used] @ (excess - mean_excess) ** 2) < LINEAR:
             return cls("linear", best, by_slopes, points, weights)
         mean, covariance = weighted_covariance(points, weights)
-        root = np.linalg.cholesky(covariance)
-
-        def squares_from_mean(coordinates: Points) -> PerPoint:
-            return np.sum(np.linalg.solve(root, (coordinates - mean).T) ** 2, axis=0)
-
-        if squares_from_mean(best[None])[0] > AT_MEAN**2:
-            scores = -2.0 * sample.pool.log_density[used] + CENTRAL * squares_from_mean(points[used])
-            best = points[used][np.argmin(scores)]
+        # The first point is the best.
+        squares, _ = squared_distances(np.vstack([best, points[used]]), mean, np.linalg.cholesky(covariance))
+        if squares[0] > AT_MEAN**2:
+            best = points[used][np.argmin(CENTRAL * squares[1:] - 2.0 * sample.log_density[used])]
         return cls("weights", best, covariance, points, weights)
 
     def interval(self, k: int, deviations: float) -> tuple[float, float]:
@@ -422,54 +421,41 @@ class Minimum(NamedTuple):
         return f"{values} (weight {self.weight:.2f})"
 
 
-def divided(points: Points, weights: PerPoint, random: np.random.Generator) -> Int[np.ndarray, " n"]:
-    """The index of the minimum to which each point belongs.
+def minima_of(explorer: Explorer, sample: Pool) -> tuple[Minimum, ...]:
+    """The minima that the data allow, the most probable first.
 
     Components of a mixture are merged where the ridge between them has no deep saddle (Ray and Lindsay, Ann. Stat. 33
     (2005) 2042).
     """
-    mixture = fitted(points, weights, COMPONENTS, random)
+    problem, used = explorer.density.problem, sample.weights > 0.0
+    points, weights = sample.points[used], sample.weights[used]
+    mixture = fitted(points, weights, COMPONENTS, np.random.default_rng(0))
+    inverse = [np.linalg.inv(root @ root.T) for root in mixture.roots]
     parent = list(range(len(mixture.shares)))
     for a in range(len(parent)):
         for b in range(a):
             # The curve on which the density of the two components has its ridge.
-            inverse = [np.linalg.inv(mixture.roots[k] @ mixture.roots[k].T) for k in (a, b)]
             ridge = []
             for share in np.linspace(0.0, 1.0, 33):
-                first, second = (1.0 - share) * inverse[0], share * inverse[1]
+                first, second = (1.0 - share) * inverse[a], share * inverse[b]
                 ridge.append(np.linalg.solve(first + second, first @ mixture.centres[a] + second @ mixture.centres[b]))
-            density = np.logaddexp.reduce(_log_normals(mixture, np.stack(ridge)), axis=0)
+            density = np.logaddexp.reduce(mixture.log_normals(np.stack(ridge)), axis=0)
             if np.min(density) > min(density[0], density[-1]) + math.log(SADDLE):
                 parent = [parent[b] if group == parent[a] else group for group in parent]
-    return np.array(parent)[np.argmax(_log_normals(mixture, points), axis=0)]
-
-
-def _log_normals(mixture: Mixture, points: Points) -> Float[np.ndarray, "components n"]:
-    """The log densities of Gaussian components, weighted by their shares, up to a constant."""
-    squares, log_volumes = squared_distances(points, mixture.centres, mixture.roots)
-    return (np.log(mixture.shares) - log_volumes)[:, None] - 0.5 * squares
-
-
-def minima_of(explorer: Explorer, sample: Weighted) -> tuple[Minimum, ...]:
-    """The minima that the data allow, the most probable first."""
-    points, weights, problem = sample.pool.points, sample.weights, explorer.density.problem
-    used = weights > 0.0
-    groups = np.full(len(points), -1)
-    groups[used] = divided(points[used], weights[used], np.random.default_rng(0))
+    groups = np.array(parent)[np.argmax(mixture.log_normals(points), axis=0)]
     minima = []
-    for group in np.unique(groups[used]):
-        members = np.flatnonzero(groups == group)
-        best = members[np.argmax(sample.pool.log_density[members])]
-        values = np.asarray(problem.values(points[best])).tolist()
-        deviance = float(-2.0 * np.sum(sample.pool.groups[best]))
-        minima.append(Minimum(dict(zip(problem.names, values, strict=True)), float(np.sum(weights[members])), deviance))
+    for group in np.unique(groups):
+        best = np.flatnonzero(groups == group)[np.argmax(sample.log_density[used][groups == group])]
+        values = dict(zip(problem.names, np.asarray(problem.values(points[best])).tolist(), strict=True))
+        deviance = float(-2.0 * np.sum(sample.groups[used][best]))
+        minima.append(Minimum(values, float(np.sum(weights[groups == group])), deviance))
     return tuple(sorted((minimum for minimum in minima if minimum.weight > LEAST_WEIGHT), key=lambda m: -m.weight))
 
 
-def roughness(explorer: Explorer, sample: Weighted) -> float:
+def roughness(explorer: Explorer, sample: Pool) -> float:
     """Root mean square of the distances of predictions from a smooth trend, in units of their errors."""
-    weights, points = sample.weights, sample.pool.points
-    used = (weights > 1e-4 * np.max(weights)) & np.all(np.isfinite(sample.pool.predictions), axis=1)
+    weights, points = sample.weights, sample.points
+    used = (weights > 1e-4 * np.max(weights)) & np.all(np.isfinite(sample.predictions), axis=1)
     root = np.sqrt(weights[used] / np.sum(weights[used]))[:, None]
     centred = points[used] - weights[used] @ points[used] / np.sum(weights[used])
     centred = centred / (np.std(centred, axis=0) + 1e-300)
@@ -477,7 +463,7 @@ def roughness(explorer: Explorer, sample: Weighted) -> float:
     columns = [np.ones(len(centred)), *centred.T]
     columns += [centred[:, i] * centred[:, j] for i in range(size) for j in range(i + 1)]
     terms = np.stack(columns, axis=1)
-    predictions = sample.pool.predictions[used]
+    predictions = sample.predictions[used]
     measurements = explorer.density.measurements
     predictions = predictions - measurements.whole_periods(predictions - predictions[0])
     coefficients, *_ = np.linalg.lstsq(root * terms, root * predictions)
@@ -485,17 +471,14 @@ def roughness(explorer: Explorer, sample: Weighted) -> float:
     return float(np.sqrt(np.mean(np.sum(root**2 * off**2, axis=0))))
 
 
-def without_prediction(
-    explorer: Explorer, sample: Weighted, distribution: Distribution
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """A concern or a note of candidates whose runs have no prediction, if there are any: a concern if they lie where the
-    posterior does."""
-    problem, points = explorer.density.problem, sample.pool.points
+def without_prediction(explorer: Explorer, sample: Pool, distribution: Distribution) -> tuple[str, float]:
+    """The candidates whose runs have no prediction, in words, empty if there are none; and their share of the candidates
+    beside the estimate."""
+    problem, points = explorer.density.problem, sample.points
     evaluated = explorer.region.contains(points)
-    points, failed = points[evaluated], np.any(np.isnan(sample.pool.predictions[evaluated]), axis=1)
+    points, failed = points[evaluated], np.any(np.isnan(sample.predictions[evaluated]), axis=1)
     if not np.any(failed):
-        return (), ()
-    off = points - distribution.estimate
+        return "", 0.0
     values = np.asarray(problem.values(points[failed]))
     ends = zip(problem.names, np.min(values, axis=0), np.max(values, axis=0), strict=True)
     places = ", ".join(f"{name} {low:.4g}" + (f" to {high:.4g}" if high > low else "") for name, low, high in ends)
@@ -504,23 +487,21 @@ def without_prediction(
         f"early or was illegal: at {places}"
     )
     if not np.all(np.isfinite(distribution.covariance)):
-        return (), (words,)
-    near = np.sum(np.linalg.solve(np.linalg.cholesky(distribution.covariance), off.T) ** 2, axis=0) < BESIDE**2
-    share = np.mean(failed[near]) if np.any(near) else 0.0
-    if share > CUT:
-        return (f"{words}; of those beside the estimate, {100.0 * share:.0f} %: simulate a run there to see why",), ()
-    return (), (words,)
+        return words, 0.0
+    squares, _ = squared_distances(points, distribution.estimate, np.linalg.cholesky(distribution.covariance))
+    near = squares < BESIDE**2
+    return words, float(np.mean(failed[near])) if np.any(near) else 0.0
 
 
 def remarks(
-    explorer: Explorer, sample: Weighted, distribution: Distribution, by_slopes: Matrix
+    explorer: Explorer, sample: Pool, distribution: Distribution, by_slopes: Matrix
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is special about the shape of a posterior: concerns and notes, in words."""
     problem, region, weights = explorer.density.problem, explorer.region, sample.weights
     concerns, notes, skewed = [], [], []
-    for k, (name, unknown) in enumerate(problem.free):
+    for k, (name, unknown) in enumerate(zip(problem.names, problem.unknowns, strict=True)):
         # A bound, or the edge of the searched region, that cuts the interval of the unknown.
-        coordinate, middle, reach = sample.pool.points[:, k], region.middle[k], FARTHEST * region.half_width[k]
+        coordinate, middle, reach = sample.points[:, k], region.middle[k], FARTHEST * region.half_width[k]
         for side, edge in (("below", middle - reach), ("above", middle + reach)):
             if np.sum(weights[np.abs(coordinate - edge) < NEAR * 2.0 * reach]) > CUT:
                 concerns.append(f"the data do not bound {name} from {side}: its interval ends where the search ended")

@@ -27,10 +27,8 @@ def draw_errors(
     measurements: Measurements, prediction: Float[np.ndarray, "rows n"], random: np.random.Generator
 ) -> Float[np.ndarray, "rows series"]:
     """Logarithms of the unknown errors in units of their guesses, drawn from their distribution for given predictions."""
-    residual = compared(measurements, prediction)[0]
-    estimated = np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
     columns = [np.zeros((len(prediction), 0))]
-    for scales, logs in _by_error(measurements, prediction, residual, estimated):
+    for scales, logs in _by_error(measurements, prediction, compared(measurements, prediction)[0]):
         cumulative = np.cumsum(np.exp(logs - np.max(logs, axis=1, keepdims=True)), axis=1)
         share = random.uniform(size=len(scales)) * cumulative[:, -1]
         column = [np.interp(s, c, scale) for s, c, scale in zip(share, cumulative, scales, strict=True)]
@@ -38,9 +36,10 @@ def draw_errors(
     return np.concatenate(columns, axis=1)
 
 
-def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.ndarray, estimated: np.ndarray):
+def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.ndarray):
     """For each series of unknown error: logarithms of the error in units of its guess (rows, grid), and the log likelihood
     there."""
+    estimated = np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
     if not np.any(estimated):
         return
     series, freedom = np.asarray(measurements.series), np.asarray(measurements.student)
@@ -117,6 +116,11 @@ class Mixture(NamedTuple):
         logs = constants[:, None] - 0.5 * (FREEDOM + size) * np.log1p(squares / FREEDOM)
         return np.logaddexp.reduce(logs, axis=0)
 
+    def log_normals(self, points: Points) -> Float[np.ndarray, "components n"]:
+        """The log densities of Gaussian components, weighted by their shares, up to a constant."""
+        squares, log_volumes = squared_distances(points, self.centres, self.roots)
+        return (np.log(self.shares) - log_volumes)[:, None] - 0.5 * squares
+
     def joined(self, other: "Mixture", share: float) -> "Mixture":
         """This mixture, and another one that gets a share of the draws."""
         shares = np.concatenate([(1.0 - share) * self.shares, share * other.shares])
@@ -157,8 +161,7 @@ def fitted(points: Points, weights: PerPoint, components: int, random: np.random
     shares, covariances = np.full(len(centres), 1.0 / len(centres)), np.tile(whole / len(centres), (len(centres), 1, 1))
     effective = 1.0 / np.sum(weights**2)
     for _ in range(ITERATIONS):
-        squares, log_volumes = squared_distances(points, centres, np.linalg.cholesky(covariances))
-        logs = (np.log(shares) - log_volumes)[:, None] - 0.5 * squares
+        logs = Mixture(shares, centres, np.linalg.cholesky(covariances)).log_normals(points)
         parts = np.exp(logs - np.logaddexp.reduce(logs, axis=0)) * weights
         shares = np.sum(parts, axis=1)
         # A covariance needs more points than it has dimensions.
@@ -174,12 +177,12 @@ def fitted(points: Points, weights: PerPoint, components: int, random: np.random
 
 def squared_distances(
     points: Points,
-    centres: Float[np.ndarray, "components unknowns"],
-    roots: Float[np.ndarray, "components unknowns unknowns"],
-) -> tuple[Float[np.ndarray, "components n"], Float[np.ndarray, " components"]]:
+    centres: Float[np.ndarray, "*components unknowns"],
+    roots: Float[np.ndarray, "*components unknowns unknowns"],
+) -> tuple[Float[np.ndarray, "*components n"], Float[np.ndarray, "*components"]]:
     """Squared distances of points from centres in units of the covariances, and logarithms of the roots' determinants."""
-    off = np.linalg.inv(roots) @ (points.T - centres[:, :, None])
-    return np.sum(off**2, axis=1), np.sum(np.log(np.abs(np.diagonal(roots, axis1=1, axis2=2))), axis=1)
+    off = np.linalg.inv(roots) @ (points.T - centres[..., None])
+    return np.sum(off**2, axis=-2), np.sum(np.log(np.abs(np.diagonal(roots, axis1=-2, axis2=-1))), axis=-1)
 
 
 # The region in which a fit looks for minima: a box in the coordinates of the unknowns.
@@ -297,7 +300,7 @@ POWERS = (1.0, 0.4)
 
 
 class Pool(NamedTuple):
-    """All points so far.
+    """All points so far, a weighted sample of the posterior.
 
     - `points`: (n, unknowns), coordinates; `predictions`: (n, measurements).
     - `groups`: (n, groups), log likelihoods of groups of measurements; `log_prior`, `log_density`: (n,), of the posterior,
@@ -305,6 +308,8 @@ class Pool(NamedTuple):
     - `log_region`: (n,), 0 in the region of the search, and less outside of it.
     - `log_proposal`: (n,), log of the density from which all points together were drawn, times n.
     - `proposals`: pairs of a number of points and the distribution from which they were drawn.
+    - `weights`: (n,), Pareto-smoothed, with the sum 1; `k`: shape of the weights' tail; `effective`: the effective number of
+      draws.
     """
 
     points: Points
@@ -315,19 +320,14 @@ class Pool(NamedTuple):
     log_region: PerPoint
     log_proposal: PerPoint
     proposals: tuple[tuple[int, Region | Mixture], ...]
-
-    def candidates(self, count: int) -> Float[np.ndarray, "count unknowns"]:
-        """Points from which to refine: the first; then, in turn, the best for all measurements and for the early ones."""
-        totals = np.cumsum(self.groups, axis=1) + self.log_prior[:, None]
-        columns = sorted({totals.shape[1] - 1, *(totals.shape[1] * part // 8 for part in (0, 1, 2, 4))}, reverse=True)
-        ranked = np.stack([np.argsort(-totals[:, column]) for column in columns], axis=1).reshape(-1)
-        return self.points[list(dict.fromkeys([0, *ranked.tolist()]))[:count]]
+    weights: PerPoint = np.zeros(0)
+    k: float = -math.inf
+    effective: float = 0.0
 
     @property
-    def bounded(self) -> bool:
-        """Whether there is a single unknown, and the density falls towards both ends of its range."""
-        ends = self.log_density[np.argsort(self.points[:, 0])][[0, -1]]
-        return self.points.shape[1] == 1 and bool(np.all(ends < np.max(self.log_density) - FALL))
+    def enough(self) -> bool:
+        """Whether means and quantiles over the weights can be trusted."""
+        return self.effective >= ENOUGH and self.k < MOST_K
 
     def most_probable(self, count: int) -> Int[np.ndarray, " count"]:
         """The numbers of the points with the greatest density, the best first."""
@@ -349,28 +349,28 @@ class Pool(NamedTuple):
 
 
 class Explorer(NamedTuple):
-    """What is explored, and where: a density, the region of the search, and the group of every measurement."""
+    """What is explored, and where: a density, the region of the search, and the group of every measurement.
+
+    `rows`: number of points in a round: with a single unknown, whose draws are spread evenly, few are enough.
+    """
 
     density: LogDensity
     region: Region
     group: np.ndarray
+    rows: int
     random: np.random.Generator
 
     @classmethod
     def of(cls, density: LogDensity, spread: float, seed: int) -> "Explorer":
         """An explorer of the region around start values, as for `range_of`, with measurements grouped by their times."""
-        times, free, priors = np.asarray(density.measurements.time), density.problem.free, density.priors
+        times, problem = np.asarray(density.measurements.time), density.problem
+        free = zip(problem.names, problem.unknowns, strict=True)
         distinct, duration = np.unique(times), float(np.max(times))
         count = min(GROUPS, len(distinct))
         group = (np.searchsorted(distinct, times) * count) // len(distinct)
-        ends = np.array([range_of(name, unknown, priors.get(name), spread, duration) for name, unknown in free])
+        ends = np.array([range_of(name, unknown, density.priors.get(name), spread, duration) for name, unknown in free])
         region = Region(np.mean(ends, axis=1), 0.5 * np.ptp(ends, axis=1))
-        return cls(density, region, group, np.random.default_rng(seed))
-
-    @property
-    def rows(self) -> int:
-        """Number of points in a round: with a single unknown, whose draws are spread evenly, few are enough."""
-        return ROWS if len(self.region.middle) > 1 else ROWS // 8
+        return cls(density, region, group, ROWS if len(ends) > 1 else ROWS // 8, np.random.default_rng(seed))
 
     def begin(self, seed: int) -> Pool:
         """A pool of quasi-random points in the region."""
@@ -399,7 +399,9 @@ class Explorer(NamedTuple):
         with np.errstate(invalid="ignore"):
             change = np.abs(others - base) / np.asarray(self.density.measurements.error)
         is_same = np.all((others == base) | (change < NO_CHANGE), axis=(0, 2))
-        return ~is_same | self.density.proper
+        free = zip(self.density.problem.names, self.density.problem.unknowns, strict=True)
+        has_end = [name in self.density.priors or (u.has_lower and u.has_upper) for name, u in free]
+        return ~is_same | np.array(has_end)
 
     def extended(self, pool: Pool, points: Rows, proposal: Region | Mixture) -> Pool:
         """The pool with points that were drawn from a proposal."""
@@ -413,9 +415,12 @@ class Explorer(NamedTuple):
         log_region = -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
         parts = (points, predictions, groups, prior, log_density, log_region)
         grown = (np.concatenate(pair) for pair in zip(pool[:6], parts, strict=True))
-        return Pool(*grown, log_proposal=np.concatenate([old, new]), proposals=proposals)
+        pool = Pool(*grown, log_proposal=np.concatenate([old, new]), proposals=proposals)
+        logs = pool.log_weights(2.0)
+        weights, k = smoothed_weights(np.where(np.isfinite(logs), logs, -np.inf))
+        return pool._replace(weights=weights, k=k, effective=independent_number(pool.points, weights))
 
-    def explore(self, pool: Pool, minima: Mixture | None, progress: bool) -> "Weighted":
+    def explore(self, pool: Pool, minima: Mixture | None, progress: bool) -> Pool:
         """Adapt proposals to the posterior, round by round.
 
         **Arguments:** `pool`: from `begin`; `minima`: a component around each minimum that is known, or `None`;
@@ -423,19 +428,17 @@ class Explorer(NamedTuple):
         """
         with Progress(ROUNDS, "round", shown=progress) as display:
             display.begin()
-            current = Weighted.of(pool)
             for _ in range(ROUNDS):
                 mixture = self.proposal(pool, minima, 0.6 if len(pool.proposals) == 1 else KEPT)
                 # The last round draws what is missing, with some to spare.
-                rate = current.effective / max(len(current.weights) - pool.proposals[0][0], 1)
-                missing = 1.25 * (ENOUGH - current.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
-                count = self.rows if current.k >= MOST_K else int(np.clip(missing, self.rows // 8, self.rows))
+                rate = pool.effective / max(len(pool.weights) - pool.proposals[0][0], 1)
+                missing = 1.25 * (ENOUGH - pool.effective) / max(rate, 1e-3) if len(pool.proposals) > 1 else np.inf
+                count = self.rows if pool.k >= MOST_K else int(np.clip(missing, self.rows // 8, self.rows))
                 pool = self.extended(pool, mixture.draw(count, self.random), mixture)
                 display.advance(1)
-                current = Weighted.of(pool)
-                if current.enough:
+                if pool.enough:
                     break
-        return current
+        return pool
 
     def proposal(self, pool: Pool, minima: Mixture | None, share: float = KEPT) -> Mixture:
         """The mixture that fits the points so far best; the components around known minima get a share of it."""
@@ -460,49 +463,20 @@ class Explorer(NamedTuple):
         residual = compared(measurements, predictions)[0]
         each, estimated = -0.5 * residual**2, np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
         likelihood = np.sum(each[:, ~estimated], axis=1)
-        for scales, logs in _by_error(measurements, predictions, residual, estimated):
+        for scales, logs in _by_error(measurements, predictions, residual):
             likelihood = likelihood + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])
         prior = np.where(inside, self.density.log_priors(batch)[: len(points)], -np.inf)
         return predictions, each, prior, likelihood + prior
 
 
-class Weighted(NamedTuple):
-    """A weighted sample of a posterior.
-
-    - `pool`: the points; `weights`: (n,), Pareto-smoothed, with the sum 1.
-    - `k`: shape of the weights' tail; `effective`: the effective number of draws.
-    """
-
-    pool: Pool
-    weights: PerPoint
-    k: float
-    effective: float
-
-    @classmethod
-    def of(cls, pool: Pool) -> "Weighted":
-        logs = pool.log_weights(2.0)
-        weights, k = smoothed_weights(np.where(np.isfinite(logs), logs, -np.inf))
-        return cls(pool, weights, k, independent_number(pool.points, weights))
-
-    @property
-    def enough(self) -> bool:
-        """Whether means and quantiles over the weights can be trusted."""
-        return self.effective >= ENOUGH and self.k < MOST_K
-
-
-def effective_number(weights: PerPoint) -> float:
-    """Number of independent draws that are worth as much as weighted ones (Kish)."""
-    return float(1.0 / np.sum(weights**2))
-
-
 def independent_number(points: Points, weights: PerPoint) -> float:
-    """Number of independent draws that are worth as much as weighted points.
+    """Number of independent draws that are worth as much as weighted points (Kish).
 
     The points of a single unknown are spread evenly, so that chance is left only in the differences of neighbouring weights
     (Wolter, "An investigation of some estimators of variance for systematic sampling", J. Am. Stat. Assoc. 79 (1984) 781);
     half of that number, because jumps of the weights, as on a staircase, are not independent.
     """
-    number = effective_number(weights)
+    number = float(1.0 / np.sum(weights**2))
     if points.shape[1] > 1:
         return number
     differences = np.diff(weights[np.argsort(points[:, 0])])
@@ -512,23 +486,22 @@ def independent_number(points: Points, weights: PerPoint) -> float:
 def tempered_weights(pool: Pool, least: float, power: float) -> PerPoint:
     """Weights of a power of the density, as close to the posterior as at least so many effective draws allow."""
 
-    def weights_at(progress: float) -> PerPoint:
+    def weights_at(progress: float) -> tuple[PerPoint, bool]:
+        """The weights, and whether they have enough effective draws."""
         # The density is flatter, the distribution of the points is what it is.
         logs = power * (pool.log_weights(progress) + pool.log_proposal) - pool.log_proposal
         logs = np.where(np.isfinite(logs), logs, -np.inf)
         weights = np.exp(logs - np.max(logs))
-        return weights / np.sum(weights)
+        weights = weights / np.sum(weights)
+        return weights, bool(1.0 / np.sum(weights**2) >= least)
 
-    weights, low, high = weights_at(2.0), 0.0, 2.0
-    if effective_number(weights) >= least:
+    (weights, is_enough), low, high = weights_at(2.0), 0.0, 2.0
+    if is_enough:
         return weights
     for _ in range(30):
         middle = 0.5 * (low + high)
-        if effective_number(weights_at(middle)) >= least:
-            low = middle
-        else:
-            high = middle
-    return weights_at(low)
+        low, high = (middle, high) if weights_at(middle)[1] else (low, middle)
+    return weights_at(low)[0]
 
 
 # Pareto-smoothed importance weights (Vehtari, Simpson, Gelman, Yao and Gabry, J. Mach. Learn. Res. 25 (2024) 72).
@@ -547,23 +520,11 @@ def smoothed_weights(log_weights: PerPoint) -> tuple[PerPoint, float]:
     order = np.argsort(weights)
     tail, cutoff = order[len(weights) - count :], weights[order[len(weights) - count - 1]] if count else 0.0
     excess = weights[tail] - cutoff
-    shape = -np.inf
-    if count >= 5 and excess[0] >= 0.0 and excess[-1] > 1e-9 * weights[order[-1]] and excess[count // 4] > 0.0:
-        shape, scale = _generalised_pareto(excess)
-        if np.isfinite(shape):
-            logs = np.log1p(-(np.arange(count) + 0.5) / count)
-            smooth = scale * np.expm1(np.minimum(-shape * logs, 700.0)) / shape if shape else -scale * logs
-            # No weight is larger than the largest of the weights.
-            weights[tail] = np.minimum(cutoff + smooth, 1.0)
-    return weights / np.sum(weights), float(shape)
-
-
-def _generalised_pareto(excess: PerPoint) -> tuple[float, float]:
-    """Shape and scale of a generalised Pareto distribution of increasing numbers (Zhang and Stephens, Technometrics 51
-    (2009) 316), with the shape drawn to 0.5 like 10 of the numbers."""
-    count = len(excess)
+    if not (count >= 5 and excess[0] >= 0.0 and excess[-1] > 1e-9 * weights[order[-1]] and excess[count // 4] > 0.0):
+        return weights / np.sum(weights), -math.inf
+    # Shape and scale of the distribution (Zhang and Stephens, Technometrics 51 (2009) 316), with the shape drawn to 0.5 like
+    # 10 of the numbers. Of a very heavy tail, most numbers are negligible.
     grid = 30 + int(np.sqrt(count))
-    # Of a very heavy tail, most numbers are negligible.
     quartile = max(excess[max(int(count / 4 + 0.5) - 1, 0)], 1e-9 * excess[-1])
     inverse = 1.0 / excess[-1] + (1.0 - np.sqrt(grid / (np.arange(1, grid + 1) - 0.5))) / (3.0 * quartile)
     shapes = np.mean(np.log1p(-inverse[:, None] * excess), axis=1)
@@ -571,4 +532,10 @@ def _generalised_pareto(excess: PerPoint) -> tuple[float, float]:
     share = np.exp(logs - np.max(logs))
     mean = np.sum(inverse * share) / np.sum(share)
     shape = np.mean(np.log1p(-mean * excess))
-    return float((count * shape + 5.0) / (count + 10.0)), float(-shape / mean)
+    scale, shape = float(-shape / mean), float((count * shape + 5.0) / (count + 10.0))
+    if np.isfinite(shape):
+        logs = np.log1p(-(np.arange(count) + 0.5) / count)
+        smooth = scale * np.expm1(np.minimum(-shape * logs, 700.0)) / shape if shape else -scale * logs
+        # No weight is larger than the largest of the weights.
+        weights[tail] = np.minimum(cutoff + smooth, 1.0)
+    return weights / np.sum(weights), shape

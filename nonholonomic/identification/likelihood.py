@@ -100,13 +100,10 @@ class Measurements(eqx.Module):
             if not np.all(np.asarray(arguments[name]) > 0.0):
                 raise ValueError(f"{name} = {shown(arguments[name])} must be positive, or infinite")
 
-        def each(argument: ArrayOrList, kind: type) -> Array:
-            return jnp.broadcast_to(jnp.asarray(argument, kind), shape)
-
-        self.value, self.upper, self.error = each(value, float), each(upper, float), each(error, float)
-        self.period, self.student = each(period, float), each(student, float)
-        self.series, self.time = each(series, int), each(time, float)
-        self.estimated = each(estimated, bool)
+        fields = {"value": value, "upper": upper, "error": error, "period": period, "student": student}
+        for name, argument in (fields | {"series": series, "time": time, "estimated": estimated}).items():
+            kind = {"series": int, "estimated": bool}.get(name, float)
+            setattr(self, name, jnp.broadcast_to(jnp.asarray(argument, kind), shape))
 
     @property
     def censored(self) -> Bool[Array, "... n"]:
@@ -320,11 +317,6 @@ class Unknown(eqx.Module):
         prior = None if free.prior is None else np.asarray(free.prior, float)
         return cls(start, unit, lower, upper, prior, math.isfinite(free.lower), math.isfinite(free.upper))
 
-    @property
-    def positive(self) -> bool:
-        """Whether the parameter cannot be negative."""
-        return bool(self.lower >= 0.0)
-
     def value(self, coordinate: Float[Array | np.ndarray, "..."]) -> Any:
         """The parameter at a coordinate; in NumPy for a NumPy array, because JAX would compile for every shape."""
         xp: Any = np if isinstance(coordinate, np.ndarray) and isinstance(self.lower, np.ndarray) else jnp
@@ -414,11 +406,8 @@ def numbered(labels: Sequence[Sequence[str]]) -> tuple[str, ...]:
 def of_data(parameters: dict[str, Value], k: int) -> dict[str, Value]:
     """The parameters of one set of data: the shared parameters, and its own parameters without the prefix `data[k].`."""
     prefix = f"data[{k}]."
-    shared = {name: value for name, value in parameters.items() if not name.startswith("data[")}
-    parameters_of_data = {
-        name.removeprefix(prefix): value for name, value in parameters.items() if name.startswith(prefix)
-    }
-    return shared | parameters_of_data
+    pairs = ((name.removeprefix(prefix), value) for name, value in parameters.items())
+    return {name: value for name, value in pairs if not name.startswith("data[")}
 
 
 def own_name(name: str) -> str:
@@ -446,10 +435,17 @@ def free_numbers(
 
     **Raises:** `ValueError` for an unknown name or illegal start values.
     """
-    candidates = [*shared, *dict.fromkeys(itertools.chain(*own))]
+    of_any = list(dict.fromkeys(itertools.chain(*own)))
+    of_each = [f"data[{k}].{name}" for k, names in enumerate(own) for name in names]
     unknowns: dict[str, Free] = {}
-    for name_or_suffix, unknown in as_free(free).items():
-        for name in _full_names(name_or_suffix, candidates, own):
+    for written, unknown in as_free(free).items():
+        if str(written).startswith(EACH):
+            end = full_name("free", written.removeprefix(EACH), of_any)
+            names = [name for name in of_each if own_name(name) == end]
+        else:
+            known = of_each if str(written).startswith("data[") else [*shared, *of_any]
+            names = [full_name("free", written, known)]
+        for name in names:
             if name in unknowns:
                 raise ValueError(f"free: {name!r} is named twice")
             unknowns[name] = unknown
@@ -465,15 +461,3 @@ def free_numbers(
         except ValueError:
             lower[name] = 0.0
     return as_free(unknowns, lower)
-
-
-def _full_names(name_or_suffix: str, candidates: list[str], names_of_data: list[list[str]]) -> list[str]:
-    """The full names that a name matches."""
-    if not str(name_or_suffix).startswith("data["):
-        return [full_name("free", name_or_suffix, candidates)]
-    if name_or_suffix.startswith(EACH):
-        all_names = list(dict.fromkeys(name for names in names_of_data for name in names))
-        name = full_name("free", name_or_suffix.removeprefix(EACH), all_names)
-        return [f"data[{k}].{name}" for k, names in enumerate(names_of_data) if name in names]
-    all_names = [f"data[{k}].{name}" for k, names in enumerate(names_of_data) for name in names]
-    return [full_name("free", name_or_suffix, all_names)]

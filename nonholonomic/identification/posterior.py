@@ -45,7 +45,7 @@ class Problem(eqx.Module):
     """A model and its free parameters.
 
     - `model`: parameters, name -> (rows,), to predictions (rows, n).
-    - `names`, `unknowns`: the names of the free parameters, and the parameters; `free` combines both.
+    - `names`, `unknowns`: the names of the free parameters, and the parameters.
     - `step`: `None` for automatic differentiation in forward mode; otherwise the step of central differences in the
       coordinates. The model then need not be differentiable, nor traceable if it has `on_host = True`.
     - `acts`: which unknowns act on a prediction; the slopes of the others are round-off, and set to zero.
@@ -62,11 +62,6 @@ class Problem(eqx.Module):
         self.names = tuple(free)
         self.unknowns = tuple(map(Unknown.of, free.values()))
         self.acts = np.ones(len(free), bool)
-
-    @property
-    def free(self) -> tuple[tuple[str, Unknown], ...]:
-        """The free parameters, each with its name."""
-        return tuple(zip(self.names, self.unknowns, strict=True))
 
     def values(self, coordinates: Float[Array | np.ndarray, "... unknowns"]) -> Any:
         """The parameters at given coordinates, a NumPy array for a NumPy array."""
@@ -195,14 +190,8 @@ def linearise(
     - `measurements`: `Measurements` of shape (n,) or (rows, n).
 
     **Returns:** a `Linearised`.
-
-    **Raises:** `ValueError` if the model does not return one prediction per measurement.
     """
-    prediction, slopes = predictions_and_slopes(problem, coordinates, mask)
-    shape = (len(coordinates), measurements.value.shape[-1])
-    if prediction.shape != shape:
-        raise ValueError(f"model must predict {shape} for {shape[0]} sets, not {prediction.shape}")
-    return weighed(problem, coordinates, prediction, slopes, measurements)
+    return weighed(problem, coordinates, *predictions_and_slopes(problem, coordinates, mask), measurements)
 
 
 def weighed(
@@ -344,17 +333,6 @@ class LogDensity(eqx.Module):
         return {f"error[{k}]": unit for k, unit in units.items()}
 
     @property
-    def _priors_in_order(self) -> tuple[Any, ...]:
-        """The prior of every unknown or `None`, in the order of the coordinates; JAX would sort a dictionary by its keys."""
-        return tuple(self.priors.get(name) for name in self.problem.names)
-
-    @property
-    def proper(self) -> Bool[np.ndarray, " unknowns"]:
-        """Which unknowns have a prior, or lie between two bounds: the data need not determine them."""
-        pairs = zip(self.problem.unknowns, self._priors_in_order, strict=True)
-        return np.array([prior is not None or (u.has_lower and u.has_upper) for u, prior in pairs])
-
-    @property
     def start(self) -> Float[Array, " unknowns"]:
         """The coordinates of the start."""
         values = [float(unknown.coordinate(unknown.start)) for unknown in self.problem.unknowns]
@@ -404,7 +382,9 @@ class LogDensity(eqx.Module):
 
     def log_priors(self, coordinates: Rows) -> Float[np.ndarray, " rows"]:
         """The log density of the priors in the coordinates, in every row."""
-        return np.asarray(_log_priors(self.problem.unknowns, self._priors_in_order, coordinates))
+        # In the order of the coordinates; JAX would sort a dictionary by its keys.
+        priors = tuple(map(self.priors.get, self.problem.names))
+        return np.asarray(_log_priors(self.problem.unknowns, priors, coordinates))
 
     @status_line("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
@@ -424,9 +404,9 @@ class LogDensity(eqx.Module):
 
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
         """The log density at given coordinates, for given predictions of the model."""
-        return self._with_errors(coordinates).log_likelihood(prediction) + _log_prior(
-            self.problem.unknowns, self._priors_in_order, coordinates
-        )
+        priors = tuple(map(self.priors.get, self.problem.names))
+        log_prior = _log_prior(self.problem.unknowns, priors, coordinates)
+        return self._with_errors(coordinates).log_likelihood(prediction) + log_prior
 
     @status_line("simulating")
     def value_and_gradient(

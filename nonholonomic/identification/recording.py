@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..text import SYNONYMS, UNITS, counted, likely, one_line, readable_unit, shown
-from ..validation import as_number, as_number_or_none, as_path, require, warn
+from ..validation import as_number, as_path, require, warn
 from .likelihood import Measurements
 
 # Only for type checkers: models stand above fits.
@@ -153,10 +153,10 @@ class AbstractRecording(AbstractData):
     launch: Any
     times: Float[Array, " times"] = eqx.field(converter=as_number)
     value: Float[Array, "times *columns"] = eqx.field(converter=as_number)
-    error: Float[Array, "..."] | None = eqx.field(converter=as_number_or_none)
+    error: Float[Array, "..."] | None = eqx.field(converter=as_number)
     quantity: str | tuple[str, ...] = eqx.field(static=True, converter=as_quantity)
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number, default=None)
     side: str = eqx.field(static=True, default="before")
     units: ClassVar[dict[str, str]] = {"times": "s", "t0": "s"}
 
@@ -240,9 +240,16 @@ class AbstractRecording(AbstractData):
     def measurements(self) -> Measurements:
         """The samples as `Measurements`, a series for each column; missing samples are omitted."""
         value = np.asarray(self.value).reshape(len(self.times), len(self.columns))
-        error = noise(value) if self.error is None else np.asarray(self.error)
-        if error.shape == np.shape(self.value):
-            error = error.reshape(value.shape)
+        if self.error is None:
+            # A first guess: the scatter of the second differences, or of the values if there are too few.
+            error = np.ones(len(self.columns))
+            for k, column in enumerate(value.T):
+                observed = column[np.isfinite(column)]
+                second = np.diff(observed, 2)
+                guess = np.median(np.abs(second)) / 0.6745 / math.sqrt(6.0) if len(second) > 2 else 0.0
+                error[k] = guess or 0.1 * float(np.ptp(observed)) or 1.0
+        else:
+            error = np.reshape(self.error, value.shape) if np.size(self.error) == value.size else np.asarray(self.error)
         is_angle = np.array([name in self.quantities.angles for name in self.columns])
 
         def each(numbers_of: ArrayLike) -> np.ndarray:
@@ -257,17 +264,6 @@ class AbstractRecording(AbstractData):
             time=each((np.asarray(self.times) - float(self.times[0]))[:, None]),
             estimated=self.error is None,
         )
-
-
-def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " columns"]:
-    """A first guess of the errors: the scatter of the second differences, or of the values if there are too few."""
-    guesses = []
-    for column in value.T:
-        observed = column[np.isfinite(column)]
-        second = np.diff(observed, 2)
-        guess = np.median(np.abs(second)) / 0.6745 / math.sqrt(6.0) if len(second) > 2 else 0.0
-        guesses.append(guess or 0.1 * float(np.ptp(observed)) or 1.0)
-    return np.array(guesses)
 
 
 # A text file of columns with a header line, read in the units of the file.
@@ -287,18 +283,38 @@ Columns = Mapping[str, Column] | None
 
 
 class TextTable(NamedTuple):
-    """The cells of a file as text: header -> cells; the number of each row's line in the file; the decimal mark; and the
-    headers that the file has more than once."""
+    """A text file of columns.
+
+    - `cells`: header -> cells as text; `lines`: the number of each row's line in the file; `decimal`: the decimal mark;
+      `repeated`: the headers that the file has more than once.
+    - `columns`: name of a column of the model -> (header, unit), or a header with its unit; `units`: name -> SI unit.
+    """
 
     path: Path
     cells: dict[str, list[str]]
     lines: list[int]
     decimal: str
-    repeated: tuple[str, ...] = ()
+    repeated: tuple[str, ...]
+    columns: Mapping[str, Column]
+    units: Mapping[str, str]
 
     @classmethod
-    def read(cls, path: Path, decimal: str) -> "TextTable":
-        """Read a file of columns."""
+    def read(
+        cls,
+        path: AnyPath,
+        columns: Columns,
+        decimal: str,
+        units: Mapping[str, str],
+        several: Mapping[str, tuple[str, ...]],
+    ) -> "TextTable":
+        """Read and check a file of columns. **Arguments:** `several`: names that stand for several columns."""
+        if decimal not in (".", ","):
+            raise ValueError(f"decimal = {shown(decimal)} must be '.' or ','")
+        if columns is not None and (not isinstance(columns, Mapping) or not columns):
+            raise ValueError(
+                f"columns = {shown(columns)} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}, or None"
+            )
+        path = as_path(path, "path")
         lines = enumerate(_text(path).splitlines(), start=1)
         text = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
         if len(text) < 2:
@@ -326,24 +342,33 @@ class TextTable(NamedTuple):
                 raise ValueError(f"path = {str(path)!r}: line {number} has {len(row)} cells, not {len(headers)}{hint}")
         cells = {header: [row[k].strip() for row in rows[1:]] for k, header in enumerate(headers)}
         repeated = tuple(header for header in cells if headers.count(header) > 1)
-        return cls(path, cells, [number for number, _ in text[1:]], decimal, repeated)
+        file = cls(path, cells, [number for number, _ in text[1:]], decimal, repeated, columns or {}, units)
+        if columns is None:
+            return file._replace(columns=file.named())
+        for name in columns:
+            if name in several:
+                raise ValueError(f"columns: {name!r} must be a single column: {', '.join(several[name])}")
+            if name not in units:
+                hint = "; did you mean 'time'?" if name == "t" else likely(name, units)
+                raise ValueError(f"columns: {shown(name)} must be one of {', '.join(units)}{hint}")
+        return file
 
-    def named(self, known: Mapping[str, str]) -> dict[str, Column]:
+    def named(self) -> dict[str, Column]:
         """The columns whose headers are names of the model's columns, with their headers."""
         columns: dict[str, Column] = {}
         for header in self.cells:
             name, unit = _split(header)
-            if name.lower() in known:
-                if name.lower() in columns:
-                    raise self._ambiguous("columns", name.lower(), [columns[name.lower()], header])
-                si = known[name.lower()]
+            name = name.lower()
+            if name in self.units:
+                if name in columns:
+                    raise self._ambiguous("columns", name, [columns[name], header])
+                si = self.units[name]
                 # Only a number without a unit needs none in its header.
                 if not unit and si != "1":
                     raise ValueError(
-                        f"columns: the header {name.lower()!r} must have a unit, such as '{name.lower()} [{si}]'; or pass "
-                        "columns, a dictionary"
+                        f"columns: the header {name!r} must have a unit, such as '{name} [{si}]'; or pass columns, a dictionary"
                     )
-                columns[name.lower()] = header if unit else (header, "1")
+                columns[name] = header if unit else (header, "1")
         if not columns.keys() - {"time", "frame"}:
             raise ValueError(
                 f"path = {str(self.path)!r}: no header is the name of a quantity with its unit, such as 'theta [deg]': pass "
@@ -351,18 +376,16 @@ class TextTable(NamedTuple):
             )
         return columns
 
-    def numbers(
-        self,
-        name: str,
-        header_and_unit: Column,
-        si: str,
-        argument: str = "columns",
-        remark: str = "",
-        infinite: bool = False,
-    ) -> np.ndarray:
-        """A column in SI units, NaN where it is missing. **Arguments:** `argument`: as for `parts`; `remark`: an addition to
-        the message about a cell that is not a number; `infinite`: whether numbers may be infinite."""
-        header, size = self.parts(name, header_and_unit, si, argument)
+    def numbers(self, name: str, remark: str = "", infinite: bool = False, error: Columns = None) -> np.ndarray:
+        """A column in SI units, NaN where it is missing.
+
+        **Arguments:** `remark`: an addition to the message about a cell that is not a number; `infinite`: whether numbers
+        may be infinite; `error`: as for `read_columns`, for the standard errors of the column.
+        """
+        header, size = self.parts(name, error)
+        if not isinstance(header, str):
+            require(header, f"error of {name}", above=0.0)
+            return np.full(len(self.lines), size * float(header))
         numbers = np.full(len(self.lines), math.nan)
         for row, (line, cell) in enumerate(zip(self.lines, self.cells[header], strict=True)):
             if cell.lower() in MISSING:
@@ -383,27 +406,22 @@ class TextTable(NamedTuple):
                 raise ValueError(f"{place} must be finite: write n/a, or nothing, for a missing sample")
         return size * numbers
 
-    def errors(self, name: str, header_and_unit: Column, si: str) -> np.ndarray:
-        """The standard errors of a column in SI units, from a column of their own or the same in all lines."""
-        header, size = self.parts(name, header_and_unit, si, "error")
-        if isinstance(header, str):
-            return self.numbers(name, header_and_unit, si, "error")
-        require(header, f"error of {name}", above=0.0)
-        return np.full(len(self.lines), size * float(header))
-
-    def parts(self, name: str, header_and_unit: Column, si: str, argument: str) -> tuple[Any, float]:
+    def parts(self, name: str, error: Columns = None) -> tuple[Any, float]:
         """The header of a column (or, for an error, possibly a number), and the factor that converts the file's numbers to
-        SI units.
-
-        **Arguments:** `name`: name of the column of the model; `header_and_unit`: (header, unit), or a header with its
-        unit; `si`: the SI unit; `argument`: "columns" or "error", for messages.
-        """
-        first, unit = header_and_unit, None
-        if isinstance(header_and_unit, tuple | list) and len(header_and_unit) == 2:
-            first, unit = header_and_unit
-        of_header = None
+        SI units. **Arguments:** as for `numbers`."""
+        argument, given = ("columns", self.columns[name]) if error is None else ("error", error[name])
+        si, of_header = self.units[name], None
+        first, unit = given if isinstance(given, tuple | list) and len(given) == 2 else (given, None)
         if isinstance(first, str):
-            first = self._header(argument, name, first)
+            matches = [first] if first in self.cells else [full for full in self.cells if _split(full)[0] == first]
+            if len(matches) > 1 or not set(self.repeated).isdisjoint(matches):
+                raise self._ambiguous(argument, name, matches)
+            if not matches:
+                raise ValueError(
+                    f"{argument}: {name!r} = {shown(first)} must be one of the headers of {str(self.path)!r}: "
+                    f"{', '.join(self.cells)}{likely(first, [*self.cells, *(_split(full)[0] for full in self.cells)])}"
+                )
+            first = matches[0]
             of_header = _split(first)[1] or None
         elif argument == "columns" or unit is None:
             first = unit = None
@@ -419,7 +437,7 @@ class TextTable(NamedTuple):
                 expected = (
                     f"(header, unit), such as ({first!r}, {known!r}), because the header has no unit that is known"
                 )
-            raise ValueError(f"{argument}: {name!r} = {shown(header_and_unit)} must be {expected}")
+            raise ValueError(f"{argument}: {name!r} = {shown(given)} must be {expected}")
         if not isinstance(unit, str):
             require(unit, f"unit of {name}")
             return first, float(unit)
@@ -428,23 +446,11 @@ class TextTable(NamedTuple):
             raise ValueError(f"unit of {name} = {shown(unit)} must be one of {', '.join(factors)}, or a number of {si}")
         if of_header is not None and SYNONYMS.get(of_header, of_header) != plain:
             raise ValueError(
-                f"{argument}: {name!r} = {shown(header_and_unit)} contradicts the header {first!r}, whose unit is {of_header}, "
+                f"{argument}: {name!r} = {shown(given)} contradicts the header {first!r}, whose unit is {of_header}, "
                 f"not {unit}: pass the header alone, {name!r}: {first!r}; if the header is wrong, correct it or pass a "
                 f"factor, the number of {si} in {unit}"
             )
         return first, factors[plain]
-
-    def _header(self, argument: str, name: str, header: str) -> str:
-        """The full header for a header, with or without its unit."""
-        matches = [header] if header in self.cells else [full for full in self.cells if _split(full)[0] == header]
-        if len(matches) > 1 or not set(self.repeated).isdisjoint(matches):
-            raise self._ambiguous(argument, name, matches)
-        if not matches:
-            raise ValueError(
-                f"{argument}: {name!r} = {shown(header)} must be one of the headers of {str(self.path)!r}: "
-                f"{', '.join(self.cells)}{likely(header, [*self.cells, *(_split(full)[0] for full in self.cells)])}"
-            )
-        return matches[0]
 
     def _ambiguous(self, argument: str, name: str, headers: Sequence[object]) -> ValueError:
         """The error for a column that the file has more than once."""
@@ -527,10 +533,19 @@ def read_columns(
     array([0.9, 0.8])
     """
     known = {"time": "s", "frame": "1"} | dict(quantities.units)
-    file, columns = _opened(path, columns, decimal, known, quantities.columns)
-    names = quantities.of(tuple(name for name in columns if name not in ("time", "frame")))
-    times = _times(file, columns, fps)
-    value = np.stack([file.numbers(name, columns[name], known[name]) for name in names], axis=1)
+    file = TextTable.read(path, columns, decimal, known, quantities.columns)
+    names = quantities.of(tuple(name for name in file.columns if name not in ("time", "frame")))
+    has_time, has_frame = ("time" in file.columns, "frame" in file.columns)
+    if fps is None:
+        if not has_time or has_frame:
+            raise ValueError("fps must be given, or the columns must have 'time'")
+        times = file.numbers("time")
+    else:
+        require(fps, "fps", above=0.0)
+        if has_time:
+            raise ValueError(f"fps = {shown(fps)} must be omitted because 'time' is among the columns")
+        times = (file.numbers("frame") if has_frame else np.arange(len(file.lines))) / float(fps)
+    value = np.stack([file.numbers(name) for name in names], axis=1)
     is_sample = np.any(np.isfinite(value), axis=1)
     mask = np.isfinite(times) & is_sample
     lines, seen = np.asarray(file.lines)[mask], times[mask]
@@ -545,7 +560,7 @@ def read_columns(
             f"path = {str(file.path)!r}: {left_out} without a time left out, the first is line {file.lines[np.argmax(lost)]}"
         )
     for k in (k for k, name in enumerate(names) if known[name] == "rad"):
-        _, size = file.parts(names[k], columns[names[k]], "rad", "columns")
+        _, size = file.parts(names[k])
         largest = np.nanmax(np.abs(value[:, k]), initial=0.0) / size
         if size < 1.0 and 0.2 < largest <= math.pi:
             warn(f"{names[k]} is at most {largest:.3g} deg in {str(file.path)!r}: is this column in rad?")
@@ -554,7 +569,7 @@ def read_columns(
         if not isinstance(error, Mapping) or set(error) != set(names):
             form = ", ".join(f"{name!r}: (standard error, unit)" for name in names)
             raise ValueError(f"error = {shown(error)} must be {{{form}}}, or None")
-        errors = np.stack([file.errors(name, error[name], known[name]) for name in names], axis=1)[mask]
+        errors = np.stack([file.numbers(name, error=error) for name in names], axis=1)[mask]
     if len(names) == 1:
         return Read(times[mask], value[mask, 0], None if errors is None else errors[:, 0], names[0])
     return Read(times[mask], value[mask], errors, names)
@@ -613,18 +628,17 @@ def read_launches(
     >>> print(falls.numbers["height"], falls.time, falls.lines)
     [1.  1.5] [0.45  inf] (2, 4)
     """
-    file, columns = _opened(path, columns, decimal, {"time": "s"} | dict(units), {})
-    if "time" not in columns:
-        raise ValueError(f"columns = {shown(columns)} must have 'time', the measured time of each launch")
-    names = [name for name in columns if name != "time"]
-    time, until = _times_of_launches(file, columns["time"], never)
-    numbers = {name: file.numbers(name, columns[name], units[name]) for name in names}
+    file = TextTable.read(path, columns, decimal, {"time": "s"} | dict(units), {})
+    if "time" not in file.columns:
+        raise ValueError(f"columns = {shown(file.columns)} must have 'time', the measured time of each launch")
+    time, until = _times_of_launches(file, never)
+    numbers = {name: file.numbers(name) for name in file.columns if name != "time"}
     if isinstance(error, Mapping):
         if set(error) != {"time"}:
             raise ValueError(
                 f"error = {shown(error)} must be {{'time': (standard error, unit)}} or a number of seconds"
             )
-        errors = file.errors("time", error["time"], "s")
+        errors = file.numbers("time", error=error)
     else:
         require(error, "error", above=0.0)
         if np.ndim(error) != 0:
@@ -632,7 +646,7 @@ def read_launches(
         errors = np.asarray(error, float)
     mask = ~np.any(np.isnan([time, *numbers.values(), np.broadcast_to(errors, time.shape)]), axis=0)
     if not np.any(mask):
-        raise ValueError(f"path = {str(file.path)!r} must have at least one line with {', '.join(columns)}")
+        raise ValueError(f"path = {str(file.path)!r} must have at least one line with {', '.join(file.columns)}")
     return ReadLaunches(
         {name: value[mask] for name, value in numbers.items()},
         time[mask],
@@ -642,36 +656,14 @@ def read_launches(
     )
 
 
-def _opened(
-    path: AnyPath, columns: Columns, decimal: str, known: Mapping[str, str], several: Mapping[str, tuple[str, ...]]
-) -> tuple[TextTable, Mapping[str, Column]]:
-    """The file and its columns, checked. **Arguments:** `known`: name of a column -> its SI unit; `several`: names that
-    stand for several columns."""
-    if decimal not in (".", ","):
-        raise ValueError(f"decimal = {shown(decimal)} must be '.' or ','")
-    if columns is not None and (not isinstance(columns, Mapping) or not columns):
-        raise ValueError(
-            f"columns = {shown(columns)} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}, or None"
-        )
-    file = TextTable.read(as_path(path, "path"), decimal)
-    columns = file.named(known) if columns is None else columns
-    for name in columns:
-        if name in several:
-            raise ValueError(f"columns: {name!r} must be a single column: {', '.join(several[name])}")
-        if name not in known:
-            hint = "; did you mean 'time'?" if name == "t" else likely(name, known)
-            raise ValueError(f"columns: {shown(name)} must be one of {', '.join(known)}{hint}")
-    return file, columns
-
-
 def _times_of_launches(
-    file: TextTable, header_and_unit: Column, never: str | Sequence[str]
+    file: TextTable, never: str | Sequence[str]
 ) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
     """The times of all lines, infinite where the event did not happen, and the limits that the file states."""
     words = (never,) if isinstance(never, str) else never
     if not isinstance(words, tuple | list) or not all(isinstance(word, str) for word in words):
         raise ValueError(f"never = {shown(never)} must be a text, such as '-', or a list of them")
-    header, _ = file.parts("time", header_and_unit, "s", "columns")
+    header, _ = file.parts("time")
     cells = file.cells[header]
     for line, cell in zip(file.lines, cells, strict=True):
         # People write a dash for a lost measurement and for an event that did not happen.
@@ -682,26 +674,9 @@ def _times_of_launches(
             )
     is_limit = np.array([cell.startswith(">") for cell in cells])
     plain = ["inf" if cell in words else cell.removeprefix(">").strip() for cell in cells]
-    numeric, remark = (
-        file._replace(cells={**file.cells, header: plain}),
-        "if it stands for an event that did not happen",
-    )
-    time = numeric.numbers("time", header_and_unit, "s", remark=f": {remark}, pass it as never", infinite=True)
+    remark = ": if it stands for an event that did not happen, pass it as never"
+    time = file._replace(cells={**file.cells, header: plain}).numbers("time", remark, infinite=True)
     for line, cell, value in zip(file.lines, cells, time, strict=True):
         if value <= 0.0:
             raise ValueError(f"{header} = {cell!r} in line {line} of {str(file.path)!r} must be greater than 0")
     return np.where(is_limit, np.inf, time), np.where(is_limit, time, np.nan)
-
-
-def _times(file: TextTable, columns: Mapping[str, Column], fps: float | None) -> np.ndarray:
-    """The clock's readings in all lines [s]."""
-    if fps is not None:
-        require(fps, "fps", above=0.0)
-        if "time" in columns:
-            raise ValueError(f"fps = {shown(fps)} must be omitted because 'time' is among the columns")
-        if "frame" not in columns:
-            return np.arange(len(file.lines)) / float(fps)
-        return file.numbers("frame", columns["frame"], "1") / float(fps)
-    if "time" not in columns or "frame" in columns:
-        raise ValueError("fps must be given, or the columns must have 'time'")
-    return file.numbers("time", columns["time"], "s")

@@ -22,8 +22,8 @@ from ..terminal import status_line
 from ..text import counted, readable_unit, require_unit, shown, text_as_html
 from ..validation import require, require_flag, require_package, require_scalars, require_whole, warn
 from ..views import draw_fit
-from .conclusions import Distribution, Profile, Verdict, judge, profiled
-from .exploration import ROWS, Explorer, Mixture, Weighted, draw_errors
+from .conclusions import Distribution, Profile, Verdict, judge, profiled, sentences
+from .exploration import ROWS, Explorer, Mixture, Pool, draw_errors
 from .likelihood import Free, Measurements, joined_data, numbered
 from .posterior import LogDensity, Model, Problem, predictions
 from .recording import AbstractRecording
@@ -275,7 +275,7 @@ class Identification:
         return "\n".join(lines)
 
 
-def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample: Weighted) -> Identification:
+def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample: Pool) -> Identification:
     """The result of a search and an exploration: the best fit, errors and intervals, and a record of all ends."""
     problem, best, measurements, count = explorer.density.problem, ends.best, ends.measurements, len(labels)
     deviances, linearised, optimum = ends.deviance, ends.linearised, ends.coordinates[ends.best]
@@ -476,24 +476,28 @@ class Draws(NamedTuple):
         # For a single unknown, the diagnostics are numbers instead of lists.
         diagnostics = (np.ravel(numbers).tolist() for numbers in _diagnosed(coordinates))
         r_hat, ess = (ByName(zip(density.names, numbers, strict=True)) for numbers in diagnostics)
-        chains, concerns, flaws = len(coordinates), (), []
-        if accepted < LEAST_ACCEPTED:
-            flaws.append(
-                f"only {100.0 * accepted:.2g} % of the proposals were accepted: start closer, or state priors or bounds that "
-                "contain the truth"
-            )
+        chains = len(coordinates)
         name, least = min(ess.items(), key=lambda item: item[1] if item[1] > 0.0 else 0.0)
-        # The ESS of chains that never move is not a number.
-        if not least >= LEAST_ESS * chains:
-            flaws.append(
-                f"the ESS of {name} is {least:.0f}, below {LEAST_ESS:.0f} for each of {chains} chains: ask for more draws"
-            )
-        if excess > FAR_BELOW + len(ess):
-            concerns = (
+        flaws = sentences(
+            (
+                accepted < LEAST_ACCEPTED,
+                f"only {100.0 * accepted:.2g} % of the proposals were accepted: start closer, or state priors or bounds that "
+                "contain the truth",
+            ),
+            # The ESS of chains that never move is not a number.
+            (
+                not least >= LEAST_ESS * chains,
+                f"the ESS of {name} is {least:.0f}, below {LEAST_ESS:.0f} for each of {chains} chains: ask for more draws",
+            ),
+        )
+        concerns = sentences(
+            (
+                excess > FAR_BELOW + len(ess),
                 f"the start is more probable than the draws, by a factor of exp({excess:.4g}): the search missed its "
                 "surroundings; start closer, state priors or bounds, or pass the coordinates of a fit",
             )
-        return cls(values, coordinates, r_hat, ess, accepted, runs, density.units, tuple(flaws), concerns)
+        )
+        return cls(values, coordinates, r_hat, ess, accepted, runs, density.units, flaws, concerns)
 
     def __str__(self) -> str:
         width = max(map(len, self.values))
@@ -584,9 +588,9 @@ def drawn(
     components = minima.components
     if known is not None:
         components = known if components is None else components.joined(known, 0.5)
-    proposal = explorer.proposal(explored.pool, components)
+    proposal = explorer.proposal(explored, components)
     steps = discarded + MOVES * draws
-    first = explored.pool.points[random.choice(len(explored.weights), chains, p=explored.weights)]
+    first = explored.points[random.choice(len(explored.weights), chains, p=explored.weights)]
     start = np.asarray(density.start)[None, : len(density.problem.names)]
     points = np.concatenate([first, proposal.draw(chains * steps, random)])
     every = np.concatenate([points, start])

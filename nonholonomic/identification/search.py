@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from ..terminal import Progress
 from ..validation import warn
-from .exploration import Explorer, Mixture, Pool, Weighted
+from .exploration import FALL, Explorer, Mixture, Pool
 from .likelihood import DOWN_WEIGHTED, Measurements, estimated_errors
 from .posterior import Linearised, Problem, deviances, linearise, predictions, predictions_and_slopes, weighed
 from .recording import AbstractRecording
@@ -93,7 +93,14 @@ def minimise(
             if converged.all():
                 break
             scale = np.maximum(scale, np.sum(current.jacobian[..., moving] ** 2, axis=1))
-            move, predicted_gain = _step(current, moving, scale, damping, reach)
+            # The damped step of every row, limited in length, and the gain that a linear model predicts.
+            jacobian, unit = current.jacobian[..., moving], np.where(scale > 0.0, scale, 1.0)
+            squares = np.einsum("rni,rnj->rij", jacobian, jacobian)
+            slope = np.einsum("rni,rn->ri", jacobian, current.residual)
+            damped = squares + (damping[:, None] * unit)[..., None] * np.eye(len(moving))
+            move = -np.linalg.solve(damped, slope[..., None])[..., 0]
+            move = move / np.maximum(1.0, np.max(np.abs(move) / reach, axis=1, keepdims=True))
+            predicted_gain = -np.einsum("ri,rij,rj->r", move, squares, move) - 2.0 * np.sum(move * slope, axis=1)
             trial_coordinates = coordinates.copy()
             trial_coordinates[:, moving] += move
             trial = linearise(problem, trial_coordinates, of_rows, ~converged)
@@ -115,25 +122,6 @@ def minimise(
 def chosen(improves: Bool[np.ndarray, " rows"], new: PyTree, old: PyTree) -> PyTree:
     """The new rows of all arrays where they are better, the old ones elsewhere."""
     return jax.tree.map(lambda new, old: np.where(improves.reshape(-1, *(1,) * (new.ndim - 1)), new, old), new, old)
-
-
-def _step(
-    current: Linearised,
-    moving: Int[np.ndarray, " moving"],
-    scale: Float[np.ndarray, "rows moving"],
-    damping: Float[np.ndarray, " rows"],
-    reach: Float[np.ndarray, " moving"],
-) -> tuple[Float[np.ndarray, "rows moving"], Float[np.ndarray, " rows"]]:
-    """The damped step of every row, limited in length, and the decrease of -2 log posterior that a linear model
-    predicts."""
-    jacobian = current.jacobian[..., moving]
-    unit = np.where(scale > 0.0, scale, 1.0)
-    squares = np.einsum("rni,rnj->rij", jacobian, jacobian)
-    slope = np.einsum("rni,rn->ri", jacobian, current.residual)
-    damped = squares + (damping[:, None] * unit)[..., None] * np.eye(unit.shape[1])
-    move = -np.linalg.solve(damped, slope[..., None])[..., 0]
-    move = move / np.maximum(1.0, np.max(np.abs(move) / reach, axis=1, keepdims=True))
-    return move, -np.einsum("ri,rij,rj->r", move, squares, move) - 2.0 * np.sum(move * slope, axis=1)
 
 
 def _promise(current: Linearised, moving: Int[np.ndarray, " moving"]) -> Float[np.ndarray, " rows"]:
@@ -216,18 +204,18 @@ def identifiability(
     **Arguments:** `estimates`: (unknowns,); `slopes`: (unknowns,), of the parameters with respect to their coordinates;
     `jacobian`: (n, unknowns), of the residuals with respect to the coordinates.
     """
-    units = np.array(
-        [abs(x) if unknown.positive else unknown.unit for x, unknown in zip(estimates, problem.unknowns, strict=True)]
+    # Changes of a parameter that cannot be negative are relative, in per cent; others in hundredths of its unit.
+    positive = [bool(unknown.lower >= 0.0) for unknown in problem.unknowns]
+    units = np.array([float(unknown.unit) for unknown in problem.unknowns])
+    values, directions = _singular(
+        jacobian * np.where(positive, np.abs(estimates), units) / np.where(slopes == 0.0, 1.0, slopes)
     )
-    relative = jacobian * units / np.where(slopes == 0.0, 1.0, slopes)
-    values, directions = _singular(relative)
     words = []
     for direction in directions:
-        # In per cent if a parameter cannot be negative, otherwise in hundredths of its unit.
-        shares = zip(direction / direction[np.argmax(np.abs(direction))], problem.free, strict=True)
+        shares = direction / direction[np.argmax(np.abs(direction))]
         parts = [
-            f"{name} {share:+.2g} %" if free.positive else f"{name} {0.01 * share * free.unit:+.2g}"
-            for share, (name, free) in shares
+            f"{name} {share:+.2g} %" if is_positive else f"{name} {0.01 * share * unit:+.2g}"
+            for name, share, is_positive, unit in zip(problem.names, shares, positive, units, strict=True)
             if abs(share) >= LEAST_SHARE
         ]
         words.append(", ".join(parts))
@@ -427,9 +415,7 @@ LAST = 4
 IMPROVED = 0.1
 
 
-def search(
-    explorer: Explorer, starts: int, max_steps: int, seed: int, progress: bool
-) -> tuple[Explorer, Minima, Weighted]:
+def search(explorer: Explorer, starts: int, max_steps: int, seed: int, progress: bool) -> tuple[Explorer, Minima, Pool]:
     """Compare candidates, refine the best, and explore the likelihood around all minima; or explore first, where steps by
     differences cost more. **Arguments:** as for `identify`.
 
@@ -461,21 +447,29 @@ def search(
     explorer = explorer._replace(density=eqx.tree_at(lambda density: density.problem, explorer.density, problem))
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
-    if problem.step is not None and (recorded or pool.bounded):
+    # Whether there is a single unknown, and the density falls towards both ends of its range.
+    ends = pool.log_density[np.argsort(pool.points[:, 0])][[0, -1]]
+    is_bounded = len(problem.names) == 1 and bool(np.all(ends < np.max(pool.log_density) - FALL))
+    if problem.step is not None and (recorded or is_bounded):
         # A step by differences takes as long as a round of the exploration, which also finds the minima.
         sample = explorer.explore(pool, None, progress)
-        best = sample.pool.points[sample.pool.most_probable(min(starts, LAST if recorded else 1))]
+        best = sample.points[sample.most_probable(min(starts, LAST if recorded else 1))]
         # Among so many points of a single unknown, the best is close to the minimum.
         steps = min(steps, 1) if sample.enough and not recorded else steps
         return explorer, refine(problem, best, measurements, steps, progress), sample
-    minima = refine(problem, pool.candidates(starts), measurements, steps, progress, in_parts=recorded)
+    # The first point; then, in turn, the best for all measurements and for the early ones.
+    totals = np.cumsum(pool.groups, axis=1) + pool.log_prior[:, None]
+    columns = sorted({totals.shape[1] - 1, *(totals.shape[1] * part // 8 for part in (0, 1, 2, 4))}, reverse=True)
+    ranked = np.stack([np.argsort(-totals[:, column]) for column in columns], axis=1).reshape(-1)
+    candidates = pool.points[list(dict.fromkeys([0, *ranked.tolist()]))[:starts]]
+    minima = refine(problem, candidates, measurements, steps, progress, in_parts=recorded)
     if recorded:
         between = minima.between()
         later = refine(problem, between, minima.measurements, min(max_steps, BETWEEN), progress)
         minima = minima.joined(problem, later)
     # Along a direction without any slope, the likelihood has no end that an exploration could find.
     has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
-    sample = explorer.explore(pool, minima.components, progress) if has_end else Weighted.of(pool)
+    sample = explorer.explore(pool, minima.components, progress) if has_end else pool
     return explorer, _improved(problem, minima, sample, max_steps, progress), sample
 
 
@@ -521,13 +515,13 @@ def _refuse_milliseconds(explorer: Explorer, pool: Pool | None) -> None:
         )
 
 
-def _improved(problem: Problem, minima: Minima, sample: Weighted, max_steps: int, progress: bool) -> Minima:
+def _improved(problem: Problem, minima: Minima, sample: Pool, max_steps: int, progress: bool) -> Minima:
     """The minima, the best of them refined to the end; or those of the best points of the exploration, if these are better."""
-    count, pool = min(LAST, len(minima.starts)), sample.pool
-    order = pool.most_probable(count)
-    deviance = deviances(problem, pool.points[order], pool.predictions[order], minima.measurements)
+    count = min(LAST, len(minima.starts))
+    order = sample.most_probable(count)
+    deviance = deviances(problem, sample.points[order], sample.predictions[order], minima.measurements)
     if np.min(deviance) < np.min(minima.deviance) - IMPROVED:
-        later = refine(problem, pool.points[order], minima.measurements, min(max_steps, FEW_STEPS), progress)
+        later = refine(problem, sample.points[order], minima.measurements, min(max_steps, FEW_STEPS), progress)
         is_better = np.min(later.weighed(problem, minima.measurements).deviance) < np.min(minima.deviance)
         return minima.joined(problem, later) if is_better else minima
     if minima.converged[minima.best]:

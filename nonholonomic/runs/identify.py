@@ -24,7 +24,7 @@ from ..integration.problem import MOST_STEPS, tolerance_bound
 from ..parameters import full_name, require_apart
 from ..terminal import status_line
 from ..text import likely, shown
-from ..validation import as_number, as_number_or_none, nan_unless, require
+from ..validation import as_number, nan_unless, require
 from .event import SILENT, time_of_event
 from .model import AbstractModel, check_run, model_of, require_event
 from .simulate import sampled
@@ -221,8 +221,8 @@ class EventTimes(AbstractEventTimes):
 
     event: Callable[..., Any] | None = None
     input: Any = None
-    until: Float[Array, "..."] | None = eqx.field(converter=as_number_or_none, default=None)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    until: Float[Array, "..."] | None = eqx.field(converter=as_number, default=None)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number, default=None)
     jumps: Sequence[float] | Array | None = None
 
     def __check_init__(self):

@@ -9,6 +9,7 @@ Until then, each finished chunk has its own file, in a folder beside the table's
 """
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -29,7 +30,7 @@ import numpy as np
 
 from ..integration.problem import FORMER_WORDS
 from ..validation import as_path, real_path, replacing, sync_folder, warn
-from .grid import EQUATIONS, LONG_NAMES, PENDING, UNREACHED, Layout, Values, boxes
+from .grid import EQUATIONS, LONG_NAMES, PENDING, Layout, Values, boxes
 
 if TYPE_CHECKING:
     import h5py
@@ -82,8 +83,7 @@ def write_file(
     # The import takes a tenth of a second, and most processes do not need it.
     import h5py
 
-    with replacing(path, folder) as scratch, scratch.open("r+b", buffering=0) as disk:
-        stream = Stream(disk)
+    with replacing(path, folder) as scratch, Stream(scratch, "r+b") as stream:
         with h5py.File(stream, "w", libver=("v110", "v110"), track_order=True) as file:
             _describe(file, layout)
             group = file.create_group(CHECKSUMS)
@@ -107,43 +107,33 @@ def write_file(
         stream.check()
 
 
-class Stream:
-    """A stream that postpones errors until `check`: HDF5 cannot close a file after a write to a full disk has
-    failed."""
+class Stream(io.FileIO):
+    """A file that keeps the first error until `check`: HDF5 cannot close a file after a write to a full disk has failed."""
 
-    def __init__(self, disk: IO[bytes]):
-        """Set the file to write to."""
-        self._disk, self._error = disk, None
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._disk, name)
+    error: OSError | None = None
 
     def write(self, data) -> int:
         """Write all data, bytes or a view of an array, unless an earlier call has failed."""
         remainder = memoryview(data)
-        with self._postponed():
-            while self._error is None and remainder:
-                remainder = remainder[self._disk.write(remainder) :]
+        try:
+            while self.error is None and remainder:
+                remainder = remainder[super().write(remainder) :]
+        except OSError as error:
+            self.error = error
         return len(data)
 
-    def truncate(self, size: int) -> int:
+    def truncate(self, size: int | None = None) -> int:
         """Change the length of the file, unless an earlier call has failed."""
-        with self._postponed():
-            if self._error is None:
-                self._disk.truncate(size)
-        return size
-
-    @contextlib.contextmanager
-    def _postponed(self) -> Iterator[None]:
         try:
-            yield
+            return super().truncate(size) if self.error is None else size or 0
         except OSError as error:
-            self._error = error
+            self.error = error
+            return size or 0
 
     def check(self) -> None:
-        """Raise the postponed error, if any."""
-        if self._error is not None:
-            raise self._error
+        """Raise the first error, if any."""
+        if self.error is not None:
+            raise self.error
 
 
 def _describe(file: "h5py.File", layout: Layout) -> None:
@@ -329,14 +319,6 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     return layout, sums
 
 
-def coded(values: Values, words: tuple[str, ...]) -> tuple[Values, tuple[str, ...]]:
-    """Words as codes, and the words in the order of their codes, beginning with the given ones."""
-    new_words = (word for word in dict.fromkeys(values.ravel().tolist()) if word not in (*words, UNREACHED))
-    words = (*words, *new_words)
-    codes = {word: code for code, word in enumerate(words)} | {UNREACHED: PENDING}
-    return np.vectorize(codes.__getitem__, otypes=[np.int8])(values), words
-
-
 # The chunks of an unfinished table.
 
 #: The files of the folder of a table's chunks, besides those of the chunks: a table without numbers, and the lock.
@@ -356,11 +338,6 @@ def chunks_in(folder: Path, layout: Layout) -> set[int]:
     """The chunks of a table whose files are in its folder."""
     chunks = {int(file.stem) for file in folder.glob("*.npz") if file.stem.isdecimal()}
     return {chunk for chunk in chunks if chunk < layout.chunks}
-
-
-def chunk_file(folder: Path, chunk: int) -> Path:
-    """The file of a chunk."""
-    return folder / f"{chunk}.npz"
 
 
 class AnotherRun(ValueError):
@@ -411,7 +388,14 @@ class ChunkStore:
         header = self.folder / HEADER
         table = Stored(header) if stored is None and header.exists() else stored
         if table is not None:
-            self._check(table)
+            difference = difference_between(table.layout, self.layout)
+            if difference is not None:
+                raise AnotherRun(self.path if table is stored else self.folder, difference)
+            old, new = table.layout.versions, self.layout.versions
+            changed = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
+            if changed and stored is None:
+                versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
+                warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning)
             # The table records the versions with which it was begun; words added since then follow its own words.
             words = dict(table.layout.words)
             for name, own_words in words.items():
@@ -463,16 +447,6 @@ class ChunkStore:
             raise OSError(f"cannot write {self.path}: {error.strerror}") from None
         write_file(header, self.layout, ())
 
-    def _check(self, table: Stored) -> None:
-        difference = difference_between(table.layout, self.layout)
-        if difference is not None:
-            raise AnotherRun(self.path if table.path == self.path else self.folder, difference)
-        old, new = table.layout.versions, self.layout.versions
-        changed = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
-        if changed and table.path != self.path:
-            versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
-            warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning)
-
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
         """Store each chunk when it is computed, and write the table's file from these and from the existing chunks.
 
@@ -483,7 +457,7 @@ class ChunkStore:
         if not self._whole:
             write_file(self.path, self.layout, self._all(computed), self.folder)
         for chunk in chunks_in(self.folder, self.layout):
-            chunk_file(self.folder, chunk).unlink(missing_ok=True)
+            (self.folder / f"{chunk}.npz").unlink(missing_ok=True)
         (self.folder / HEADER).unlink(missing_ok=True)
         return Stored(self.path)
 
@@ -503,7 +477,7 @@ class ChunkStore:
         **Raises:** `OSError` that names the path if that fails; earlier chunks remain finished.
         """
         kinds = self.layout.kinds
-        with replacing(chunk_file(self.folder, chunk)) as scratch, scratch.open("wb") as stream:
+        with replacing(self.folder / f"{chunk}.npz") as scratch, scratch.open("wb") as stream:
             arrays: dict[str, Any] = {name: np.asarray(cells, kinds[name]) for name, cells in values.items()}
             np.savez(stream, **arrays)
 
@@ -611,7 +585,7 @@ def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | 
     """The variables of a chunk; `None` if they do not match the checksums of the archive."""
     try:
         # NumPy does not close a file that it cannot read.
-        with chunk_file(folder, chunk).open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with (folder / f"{chunk}.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
             variables = {name: archive[name] for name in layout.kinds}
     # What a damaged file makes NumPy raise can be of any kind.
     except Exception:

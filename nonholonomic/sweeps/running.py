@@ -250,18 +250,17 @@ def layout_of(
     axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, object], chunk: int
 ) -> Layout:
     """The layout of a sweep's table; see `sweep`."""
-    coords = {variable.name: variable.values for variable in (*axes, *inner)}
-    units = {variable.name: variable.unit for variable in (*axes, *inner) if variable.values.dtype.kind != "U"}
-    units |= {name: variable.unit for name, variable in variables.items() if variable.words is None}
-    long_names = {variable.name: variable.long_name for variable in (*axes, *inner)}
-    long_names |= {name: variable.long_name for name, variable in variables.items()}
+    coords = {axis.name: axis.values for axis in (*axes, *inner)}
+    described = {axis.name: axis for axis in (*axes, *inner)} | variables
+    words = {name: variable.words for name, variable in variables.items() if variable.words is not None}
+    without_unit = {*words, *(name for name, values in coords.items() if values.dtype.kind == "U")}
+    units = {name: part.unit for name, part in described.items() if name not in without_unit}
     attributes = attributes_of(
         json.dumps(request | {"float": str(np.dtype(jnp.result_type(float)))}),
-        [variable.name for variable in axes],
-        {name: long_name for name, long_name in long_names.items() if long_name},
+        [axis.name for axis in axes],
+        {name: part.long_name for name, part in described.items() if part.long_name},
     )
     kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
-    words = {name: variable.words for name, variable in variables.items() if variable.words is not None}
     dims = {name: variable.inner for name, variable in variables.items() if variable.inner}
     return Layout(coords, kinds, units, attributes, words, dims, chunk)
 

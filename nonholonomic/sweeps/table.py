@@ -17,8 +17,8 @@ from ..terminal import status_line
 from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html
 from ..validation import as_path, replacing, require_package
 from ..views import draw_portrait, draw_series, draw_table, require_others
-from ._store import MAX_BYTES_IN_MEMORY, Stored, coded, table_path, unfinished, write_file
-from .grid import LONG_NAMES, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
+from ._store import MAX_BYTES_IN_MEMORY, Stored, table_path, unfinished, write_file
+from .grid import LONG_NAMES, PENDING, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
 
 if TYPE_CHECKING:
     import pandas
@@ -86,9 +86,6 @@ class Table(eqx.Module):
         """The names of the variables, and then of the coordinates."""
         return iter([*self.variables, *self.coords])
 
-    def __contains__(self, name: object) -> bool:
-        return name in self.variables or name in self.coords
-
     def _ipython_key_completions_(self) -> list[str]:
         return list(self)
 
@@ -139,12 +136,12 @@ class Table(eqx.Module):
                 )
             return dataset
 
-        def described(name: str, dims: tuple[str, ...], values: Values) -> tuple[object, ...]:
-            long_name = {"long_name": self.long_names[name]} if name in self.long_names else {}
-            return dims, values, long_name | ({"units": self.units[name]} if name in self.units else {})
-
-        variables = {name: described(name, self.dims(name), values) for name, values in self.variables.items()}
-        coords = {name: described(name, (name,), values) for name, values in self.coords.items()}
+        variables, coords = {}, {}
+        for name in self:
+            dims = self.dims(name) if name in self.variables else (name,)
+            described = {"long_name": self.long_names.get(name), "units": self.units.get(name)}
+            described = {key: text for key, text in described.items() if text is not None}
+            (variables if name in self.variables else coords)[name] = (dims, self[name], described)
         attributes = {name: value for name, value in self.attributes.items() if name != LONG_NAMES}
         dataset = xarray.Dataset(variables, coords, attributes)
         return dataset if chunks is None else dataset.chunk(chunks)
@@ -214,7 +211,12 @@ class Table(eqx.Module):
         for name, values in self.variables.items():
             arrays[name] = np.asarray(values)
             if arrays[name].dtype.kind == "U":
-                arrays[name], words[name] = coded(arrays[name], self.words.get(name, ()))
+                # Words that are not listed follow those that are.
+                listed = self.words.get(name, ())
+                used = dict.fromkeys(arrays[name].ravel().tolist())
+                words[name] = (*listed, *(word for word in used if word not in (*listed, UNREACHED)))
+                codes = {word: code for code, word in enumerate(words[name])} | {UNREACHED: PENDING}
+                arrays[name] = np.vectorize(codes.__getitem__, otypes=[np.int8])(arrays[name])
         kinds = {name: values.dtype for name, values in arrays.items()}
         layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, CHUNK)
         flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in arrays.items()}

@@ -17,7 +17,7 @@ from ..compilation.xla_cpu import Function
 from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
 from ..integration.problem import CROSSED, FAILED, UNRESOLVED, Status
-from ..parameters import Parameters, check_again, has_checks, require_apart, short_names
+from ..parameters import Parameters, checks_of, require_apart, short_names
 from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import (
@@ -125,11 +125,15 @@ class OwnModel(AbstractModel):
                 raise ValueError(problem_of_start(parts, rule, mode))
 
     def require_values(self, values: dict[str, ArrayLike]) -> None:
-        check_again(self.replaced(values).parameters.tree)
+        for module, kind in checks_of(self.replaced(values).parameters.tree):
+            vars(kind)["__check_init__"](module)
 
     def check_axes(self, grid: list[Axis], cells: object) -> None:
         tree = self.parameters.tree
-        for axis in grid if has_checks(tree["system"]) or has_checks(tree["event"]) else ():
+        kinds = [kind for _, kind in (*checks_of(tree["system"]), *checks_of(tree["event"]))]
+        # If a user's module checks its numbers, every value of an axis must be checked.
+        has_checks = any(not kind.__module__.startswith("nonholonomic.") for kind in kinds)
+        for axis in grid if has_checks else ():
             for value in axis.values:
                 self.require_values({axis.number: value})
 

@@ -17,7 +17,6 @@ from nonholonomic.validation import (
     Bound,
     Bounded,
     as_number,
-    as_number_or_none,
     is_traced,
     largest,
     require,
@@ -317,7 +316,7 @@ class Goal(Bounded):
     units: ClassVar[dict[str, str]] = {"place": "m or rad", "heading": "rad", "speed": "m s-1", "within": "1"}
 
     place: tuple[Float[Array, ""], ...] = eqx.field(converter=as_place)
-    heading: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    heading: Float[Array, ""] | None = eqx.field(converter=as_number, default=None)
     speed: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     within: Float[Array, ""] = eqx.field(converter=as_number, default=0.05, metadata=Bound.POSITIVE)
 

@@ -13,7 +13,8 @@ import tippe
 
 
 def unknowns_of(scene, data, free):
-    return dict(tippe.log_density(scene, data, free).problem.free)
+    problem = tippe.log_density(scene, data, free).problem
+    return dict(zip(problem.names, problem.unknowns, strict=True))
 
 
 LAUNCHES = {"theta": (0.4, 0.5), "spin": (100.0, 110.0), "azimuth": (0.7, 3.0), "t0": (0.013, 0.2), "samples": (30, 24)}
