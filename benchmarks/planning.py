@@ -137,8 +137,8 @@ def judged(problem: Problem, answer: Any, cpu: float, wall: float) -> Outcome:
     """The outcome of an answer of another planner, or of `None`."""
     if answer is None:
         return Outcome(False, cpu, wall, np.nan)
-    splines = [interpolate(part) for part in (answer.steering, answer.front_speed)]
-    drive = drive_along(problem.scene.dynamics, problem.start_pose, splines[0], splines[1], answer.t1)
+    splines = interpolate(np.stack([answer.steering, answer.front_speed], axis=1))
+    drive = drive_along(problem.scene.dynamics, problem.start_pose, splines, answer.t1)
     plan = checked_drive(dataclasses.replace(problem, t1=answer.t1), drive, TIGHT, CONFIRMED)
     return Outcome(plan.reached, cpu, wall, plan.effort)
 

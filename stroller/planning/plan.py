@@ -22,7 +22,7 @@ from ..model.vehicle import Launch
 from .planner import Planner, proposed
 from .problem import MOST_STEERING, Box, Disc, Footprint, Goal, Limits, Problem, checked_problem
 from .result import ALLOWED, Plan, checked_drive
-from .search import INTERVALS, paths_of, prices, soonest, unknowns_of
+from .search import INTERVALS, guess_of, paths_of, prices
 from .transcription import (
     FINE,
     LIMIT_RESERVE,
@@ -159,8 +159,6 @@ def _guesses(
     rng = np.random.default_rng(seed)
     if planner is not None:
         task = Task.of(problem, problem.distance, problem.t1, problem.clearance)
-        if (misfit := planner.misfit(task)) is not None:
-            raise ValueError(f"planner: {misfit}; learn in this scene")
         proposal = proposed(planner, task, problem.t1)
         if proposal is not None:
             yield problem.distance, Candidates(proposal[None], np.full(1, problem.t1))
@@ -170,10 +168,8 @@ def _guesses(
         reasons.extend([reason] if reason else [])
         if len(reasons) > PATIENCE:
             return
-        way = min(float(path.length.sum()) for path in paths)
-        durations = np.array([soonest(problem, path) if problem.in_haste else problem.t1 for path in paths])
-        unknowns = [unknowns_of(problem, path, t1) for path, t1 in zip(paths, durations, strict=True)]
-        yield way, Candidates(np.stack(unknowns), durations)
+        unknowns, durations = zip(*(guess_of(problem, path) for path in paths), strict=True)
+        yield min(float(path.length.sum()) for path in paths), Candidates(np.stack(unknowns), np.array(durations))
 
 
 def _attempts(
@@ -191,8 +187,8 @@ def _attempts(
             for lane in np.lexsort((values, violation > HOPELESS)):
                 if attempts and violation[lane] > HOPELESS:
                     break
-                (steering, front_speed), t1 = candidates.unknowns[lane].T[-2:], float(candidates.durations[lane])
-                drive = drive_along(problem.scene.dynamics, problem.start_pose, steering, front_speed, t1)
+                splines, t1 = candidates.unknowns[lane][:, -2:], float(candidates.durations[lane])
+                drive = drive_along(problem.scene.dynamics, problem.start_pose, splines, t1)
                 attempt = checked_drive(problem, drive, tolerance, COMPARED)
                 # A solution is driven again at a tight tolerance, and this run counts.
                 attempts.append(checked_drive(problem, drive, TIGHT, CONFIRMED) if attempt.reached else attempt)

@@ -10,16 +10,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
-from nonholonomic.geometry import Plane, cross, dot, scale
+from nonholonomic.geometry import Plane, dot
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.text import likely, shown
 from nonholonomic.validation import require, require_flag, require_kind, require_package, require_whole
 
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import Scene
-from .problem import FAR, Pose, checked_problem, seen_from_above
+from .problem import FAR, Pose, checked_problem, frame_of
 from .transcription import ORDER, Numbers, Task, drive_from, motion_at, point_residuals, windows
 
 # A network that proposes drives, step by step: it sees the goal and the obstacles from where the stroller is.
@@ -50,33 +50,9 @@ class Proposal(NamedTuple):
     """A drive: coefficients of the steering angle [rad] and of the front wheel's speed [m/s], the poses before each step of
     the integration, and the pose at the end."""
 
-    steering: Float[Array, " rows"]
-    front_speed: Float[Array, " rows"]
+    splines: Float[Array, "rows 2"]
     poses: Float[Array, "decisions parts components"]
     end: Pose
-
-
-def goal_seen(task: Task, pose: Pose) -> Float[Array, " 6"]:
-    """The goal as it is seen from a pose, six numbers: ahead and to the left, on two scales, and its heading."""
-    dynamics, axes = task.dynamics, task.dynamics.surface.axes
-    place, heading = padded(pose[:axes]), padded(pose[axes:])
-    left = scale(dynamics.side, cross(dynamics.surface.normal(place), heading))
-    away, goal_heading = padded((task.goal[0] - pose)[:axes] / task.length), padded(task.goal[0][axes:])
-    ahead, aside = dot(away, heading), dot(away, left)
-    turned = [task.has_heading * dot(goal_heading, heading), task.has_heading * dot(goal_heading, left)]
-    # Lengths are on a scale that is logarithmic for great ones.
-    return jnp.stack([*(jnp.arcsinh(length) for length in (ahead, aside, 4.0 * ahead, 4.0 * aside)), *turned])
-
-
-def obstacles_seen(task: Task, pose: Pose) -> tuple[Float[Array, "obstacles 8"], Bool[Array, " obstacles"]]:
-    """The corners of all obstacles as they are seen from a pose, a disc as a square; and whether a row is an obstacle or only
-    pads the list."""
-    square = jnp.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
-    discs = task.obstacles.centres[:, None] + square * task.obstacles.radii[:, None, None]
-    corners = jnp.concatenate([task.obstacles.boxes, discs])
-    place, *directions = seen_from_above(task.dynamics, pose)
-    seen = jnp.arcsinh((corners - place) @ jnp.stack(directions, axis=1) / task.length)
-    return seen.reshape(len(seen), CORNERS), jnp.abs(corners[:, 0, 0]) < 0.1 * FAR
 
 
 class Planner(eqx.Module):
@@ -130,22 +106,26 @@ class Planner(eqx.Module):
             type(task.dynamics.surface).__name__,
         )
 
-    def misfit(self, task: Task) -> str | None:
-        """Why the planner is not for a task, in words; `None` if it has learned for its kind of ground and its wheelbase."""
-        ground, wheelbase = type(task.dynamics.surface).__name__, float(task.dynamics.body.wheelbase)
-        if ground != self.ground:
-            return f"it has learned on a {self.ground}, and the ground of this scene is a {ground}"
-        if abs(wheelbase - self.wheelbase) > OTHER_WHEELBASE * self.wheelbase:
-            return f"it has learned with a wheelbase of {self.wheelbase:g} m, and that of this scene is {wheelbase:g} m"
-        return None
-
     def decide(self, task: Task, pose: Pose, known: Float[Array, " known"]) -> Float[Array, " 2"]:
-        """Two numbers, from a pose and what else is known."""
-        corners, is_there = obstacles_seen(task, pose)
-        each = jnp.where(is_there[:, None], jax.vmap(self.of_obstacle)(corners.astype(jnp.float32)), 0.0)
-        place = [] if isinstance(task.dynamics.surface, Plane) else [pose]
-        seen = jnp.concatenate([goal_seen(task, pose), known, *place, each.sum(axis=0), each.max(axis=0, initial=0.0)])
-        return self.of_step(seen.astype(jnp.float32)).astype(float)
+        """Two numbers, from what is seen from a pose and what else is known."""
+        dynamics, axes, obstacles = task.dynamics, task.dynamics.surface.axes, task.obstacles
+        place, heading, left = frame_of(dynamics, pose)
+        # Of the goal: ahead and to the left, on two scales that are logarithmic for great lengths, and its heading.
+        away, goal_heading = padded((task.goal[0] - pose)[:axes] / task.length), padded(task.goal[0][axes:])
+        ahead, aside = dot(away, heading), dot(away, left)
+        lengths = [jnp.arcsinh(length) for length in (ahead, aside, 4.0 * ahead, 4.0 * aside)]
+        turned = [task.has_heading * dot(goal_heading, heading), task.has_heading * dot(goal_heading, left)]
+        # Of the obstacles: their corners, a disc as a square. Those that pad the list are far away.
+        square = jnp.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
+        corners = [obstacles.boxes, obstacles.centres[:, None] + square * obstacles.radii[:, None, None]]
+        corners = jnp.concatenate(corners)
+        origin, *directions = (jnp.stack(part[:2]) for part in (place, heading, left))
+        seen = jnp.arcsinh((corners - origin) @ jnp.stack(directions, axis=1) / task.length)
+        each = jax.vmap(self.of_obstacle)(seen.reshape(-1, CORNERS).astype(jnp.float32))
+        each = jnp.where(jnp.abs(corners[:, :1, 0]) < 0.1 * FAR, each, 0.0)
+        own = [] if isinstance(dynamics.surface, Plane) else [pose]
+        parts = [jnp.stack([*lengths, *turned]), known, *own, each.sum(axis=0), each.max(axis=0, initial=0.0)]
+        return self.of_step(jnp.concatenate(parts).astype(jnp.float32)).astype(float)
 
     def propose(self, task: Task, t1: Numbers, number: Int[Array, ""]) -> Proposal:
         """One of the proposals for a problem."""
@@ -156,7 +136,8 @@ class Planner(eqx.Module):
         fixed = jnp.stack([jnp.log(t1), jnp.log(speed), task.has_heading, task.goal[1] / speed])
 
         def decision(carry, k):
-            pose, angles, speeds = carry
+            pose, latest = carry
+            angles, speeds = latest.T
             left = (1.0 - k / DECISIONS)[None]
             known = jnp.concatenate([left, fixed, angles, speeds / speed, which])
             turn, ahead = self.decide(task, pose, known)
@@ -164,31 +145,36 @@ class Planner(eqx.Module):
             is_last = k >= DECISIONS - ORDER + 1
             angle = jnp.where(k > DECISIONS - ORDER + 1, angles[-1], angle)
             next_speed = jnp.where(is_last, task.goal[1] / jnp.cos(angle), FASTEST * speed * jnp.tanh(ahead / FASTEST))
-            window = jnp.append(angles, angle), jnp.append(speeds, next_speed)
+            window = jnp.concatenate([latest, jnp.stack([angle, next_speed])[None]])
             poses = []
             for part in range(PARTS):
                 poses.append(pose)
                 pose = drive_from(task.dynamics, pose, window, part / PARTS, 1.0 / PARTS, duration)
-            return (pose, window[0][1:], window[1][1:]), (angle, next_speed, jnp.stack(poses))
+            return (pose, window[1:]), (window[-1], jnp.stack(poses))
 
-        first = steering + steering_rate * duration * change, front_speed + 0.0 * change
-        (end, _, _), (angles, speeds, poses) = jax.lax.scan(
-            jax.checkpoint(decision), (pose, *first), jnp.arange(DECISIONS)
-        )
-        return Proposal(jnp.concatenate([first[0], angles]), jnp.concatenate([first[1], speeds]), poses, end)
+        first = jnp.stack([steering + steering_rate * duration * change, front_speed + 0.0 * change], axis=1)
+        (end, _), (rows, poses) = jax.lax.scan(jax.checkpoint(decision), (pose, first), jnp.arange(DECISIONS))
+        return Proposal(jnp.concatenate([first, rows]), poses, end)
+
+    def proposals(self, task: Task, t1: Numbers) -> tuple[Float[Array, " proposals"], Proposal]:
+        """The merits of all proposals for a problem, and the proposals."""
+
+        def of_one(number: Int[Array, ""]) -> tuple[Numbers, Proposal]:
+            proposal = self.propose(task, t1, number)
+            return merit(task, proposal, t1), proposal
+
+        return jax.vmap(of_one)(jnp.arange(PROPOSALS))
 
 
 def merit(task: Task, proposal: Proposal, t1: Numbers) -> Numbers:
     """How far a proposal is from solving a problem: the weighted squares of what it misses, breaks and spends."""
-    rows = windows(proposal.steering), windows(proposal.front_speed)
 
-    def of_decision(poses, *window):
-        def at(pose, part):
-            return point_residuals(task, pose, motion_at(window, part / PARTS, t1 / DECISIONS))
+    def at(pose, window, part):
+        return point_residuals(task, pose, motion_at(window, part / PARTS, t1 / DECISIONS))
 
-        return jax.vmap(at)(poses, jnp.arange(PARTS))
-
-    inequalities, effort = jax.vmap(of_decision)(proposal.poses, *rows)
+    of_decision = jax.vmap(at, (0, None, 0))
+    of_all = jax.vmap(of_decision, (0, 0, None))
+    inequalities, effort = of_all(proposal.poses, windows(proposal.splines), jnp.arange(PARTS))
     axes, away = task.dynamics.surface.axes, proposal.end - task.goal[0]
     missed = jnp.sum(away[:axes] ** 2) / task.length**2 + task.has_heading * jnp.sum(away[axes:] ** 2)
     broken = jnp.sum(jnp.minimum(inequalities, 0.0) ** 2)
@@ -196,29 +182,31 @@ def merit(task: Task, proposal: Proposal, t1: Numbers) -> Numbers:
 
 
 @eqx.filter_jit
-def _best(planner: Planner, task: Task, t1: Numbers) -> tuple[Numbers, Proposal]:
-    """The merit and the drive of the best proposal."""
-
-    def of_one(number: Int[Array, ""]) -> tuple[Numbers, Proposal]:
-        proposal = planner.propose(task, t1, number)
-        return merit(task, proposal, t1), proposal
-
-    merits, proposals = jax.vmap(of_one)(jnp.arange(PROPOSALS))
-    best = jnp.argmin(jnp.where(jnp.isfinite(merits), merits, jnp.inf))
-    return jax.tree.map(lambda part: part[best], (merits, proposals))
+def _proposals(planner: Planner, task: Task, t1: Numbers) -> tuple[Float[Array, " proposals"], Proposal]:
+    return planner.proposals(task, t1)
 
 
 def proposed(planner: Planner, task: Task, t1: float) -> Float[np.ndarray, "rows unknowns"] | None:
-    """The best proposal as unknowns of the optimiser (see `transcription.py`); `None` if no proposal is finite."""
-    least, proposal = jax.tree.map(np.asarray, _best(planner, task, jnp.asarray(t1)))
-    if not np.isfinite(least):
+    """The best proposal as unknowns of the optimiser (see `transcription.py`); `None` if no proposal is finite. Raises
+    `ValueError` if the planner has learned on another kind of ground or with another wheelbase."""
+    ground, wheelbase = type(task.dynamics.surface).__name__, float(task.dynamics.body.wheelbase)
+    misfit = None
+    if ground != planner.ground:
+        misfit = f"learned on a {planner.ground}, and the ground of this scene is a {ground}"
+    elif abs(wheelbase - planner.wheelbase) > OTHER_WHEELBASE * planner.wheelbase:
+        misfit = f"learned with a wheelbase of {planner.wheelbase:g} m, and that of this scene is {wheelbase:g} m"
+    if misfit is not None:
+        raise ValueError(f"planner: it has {misfit}; learn in this scene")
+    merits, proposals = jax.tree.map(np.asarray, _proposals(planner, task, jnp.asarray(t1)))
+    best = np.argmin(np.where(np.isfinite(merits), merits, np.inf))
+    if not np.isfinite(merits[best]):
         return None
+    coarse, poses, end = (part[best] for part in proposals)
     # The same splines with an interval for each step of the integration.
-    coarse = np.stack([proposal.steering, proposal.front_speed], axis=1)
     splines = np.empty((PARTS * (len(coarse) - ORDER + 1) + ORDER - 1, 2))
     splines[::2] = (coarse[:-1] + coarse[1:]) / 2.0
     splines[1::2] = (coarse[:-2] + 6.0 * coarse[1:-1] + coarse[2:]) / 8.0
-    poses = np.concatenate([proposal.poses.reshape(-1, len(proposal.end)), np.tile(proposal.end, (ORDER - 1, 1))])
+    poses = np.concatenate([poses.reshape(-1, len(end)), np.tile(end, (ORDER - 1, 1))])
     return np.concatenate([poses, splines], axis=1)
 
 
@@ -325,22 +313,12 @@ def drawn_task(
     return Task.of(problem, problem.distance, problem.t1, problem.clearance), problem.t1
 
 
-def stacked(tasks: list[tuple[Task, float]]) -> tuple[Task, Float[np.ndarray, " tasks"]]:
-    """Tasks with as many obstacles each, as arrays with one row for each of them, without their common dynamics."""
-    most = [max(len(getattr(task.obstacles, name)) for task, _ in tasks) for name in ("boxes", "radii")]
-    # A task without a limit of the grip has a limit that nothing reaches.
-    common = {"dynamics": None, "with_grip": any(task.with_grip for task, _ in tasks)}
-    padded = [dataclasses.replace(task, obstacles=task.obstacles.padded(*most), **common) for task, _ in tasks]
-    return jax.tree.map(lambda *parts: np.stack(parts), *padded), np.array([t1 for _, t1 in tasks])
-
-
 def loss(planner: Planner, dynamics: Dynamics, tasks: Task, t1: Float[Array, " tasks"]) -> Float[Array, ""]:
     """What learning minimises: the mean over all problems of the merit of the best proposal, on a logarithmic scale."""
 
     def of_one(task: Task, t1: Numbers) -> Numbers:
         task = eqx.tree_at(lambda task: task.dynamics, task, dynamics, is_leaf=lambda part: part is None)
-        merits = jax.vmap(lambda number: merit(task, planner.propose(task, t1, number), t1))(jnp.arange(PROPOSALS))
-        values = jnp.log1p(merits)
+        values = jnp.log1p(planner.proposals(task, t1)[0])
         return values.min() + SHARE * values.mean()
 
     return jnp.mean(jax.vmap(of_one)(tasks, t1))
@@ -359,7 +337,12 @@ def trained(
 
     if seconds == 0.0:
         return planner
-    pool, times = stacked(tasks)
+    # As many obstacles in each task, no limit of the grip as one that nothing reaches, and the common dynamics left out.
+    most = [max(len(getattr(task.obstacles, name)) for task, _ in tasks) for name in ("boxes", "radii")]
+    common = {"dynamics": None, "with_grip": any(task.with_grip for task, _ in tasks)}
+    padded = [dataclasses.replace(task, obstacles=task.obstacles.padded(*most), **common) for task, _ in tasks]
+    pool = jax.tree.map(lambda *parts: np.stack(parts), *padded)
+    times = np.array([t1 for _, t1 in tasks])
     # A drive that went astray has no useful slope.
     optimiser = optax.apply_if_finite(optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam()), 2**31 - 1)
 

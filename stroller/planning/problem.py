@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import AbstractSurface, Plane, cross, scale
+from nonholonomic.geometry import AbstractSurface, Plane, Vector, cross, scale
 from nonholonomic.integration.problem import require_run
 from nonholonomic.text import shown
 from nonholonomic.validation import (
@@ -27,7 +27,7 @@ from nonholonomic.validation import (
 
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import Scene
-from ..model.vehicle import Launch, Stroller, as_numbers, as_place, suspected_degrees
+from ..model.vehicle import Launch, as_numbers, as_place, suspected_degrees
 
 #: Numbers, and points (..., points, 2), in NumPy or in JAX.
 Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
@@ -93,8 +93,11 @@ class Box(Bounded):
         return np.array(self.centre, dtype=float) + own @ np.array([[cosine, sine], [-sine, cosine]])
 
     def distance(self, polygon: Float[np.ndarray, "*n 4 2"]) -> Float[np.ndarray, "*n"]:
-        """The exact distance [m] of polygons from the box, negative where they overlap."""
-        return signed_distance(polygon, self.corners)
+        """The exact distance [m] of polygons from the box, minus the depth of penetration where they overlap."""
+        corners = self.corners
+        gap = separation(polygon, corners)
+        apart = np.minimum(_edge_distance(polygon, corners).min(-1), _edge_distance(corners, polygon).min(-1))
+        return np.where(gap > 0.0, apart, gap)
 
 
 class Disc(Bounded):
@@ -160,11 +163,6 @@ class Footprint(Bounded):
         yield from super().bounds()
         yield Bound(self.rear, "rear", at_most=self.length, why="the length")
 
-    @classmethod
-    def of(cls, body: Stroller) -> "Footprint":
-        """The footprint of the vehicle that the pages draw."""
-        return cls(*(part * body.wheelbase for part in DRAWN))
-
     def corners(self, place: Points, heading: Points, left: Points) -> Points:
         """The corners [m], counterclockwise. **Arguments:** `place`: the rear axle [m]; `heading`, `left`: unit vectors
         of the stroller, seen from above."""
@@ -220,9 +218,11 @@ def require_obstacles(obstacles: Iterable[Box | Disc]) -> tuple[Box | Disc, ...]
     return parts
 
 
-# Distances between a convex polygon that moves and obstacles: convex polygons and discs. Arrays have the shape
-# (..., vertices, 2), counterclockwise. The functions use only operators and methods that NumPy and JAX share, so that the
-# optimiser and the check share them.
+# Distances between rectangles and discs. Arrays have the shape (..., corners, 2), counterclockwise. The functions use only
+# operators and methods that NumPy and JAX share, so that the optimiser and the check share them.
+
+#: The next corner of each.
+NEXT = [1, 2, 3, 0]
 
 
 def _least(values: Numbers, axis: int) -> Numbers:
@@ -235,13 +235,9 @@ def _least(values: Numbers, axis: int) -> Numbers:
     return xp.take_along_axis(values, xp.expand_dims(values.argmin(axis), axis), axis).squeeze(axis)
 
 
-def _next(polygon: Points) -> Points:
-    return polygon[..., np.roll(np.arange(polygon.shape[-2]), -1), :]
-
-
 def _face_gaps(polygon: Points, points: Points) -> Numbers:
     """How far points (..., points, 2) are outside each face of a polygon: (..., faces, points)."""
-    edge = _next(polygon) - polygon
+    edge = polygon[..., NEXT, :] - polygon
     length = (edge * edge).sum(-1) ** 0.5
     normal_x, normal_y = edge[..., 1] / length, -edge[..., 0] / length
     offset = normal_x * polygon[..., 0] + normal_y * polygon[..., 1]
@@ -261,18 +257,11 @@ def separation(first: Points, second: Points) -> Numbers:
 
 def _edge_distance(polygon: Points, points: Points) -> Numbers:
     """Distance [m] of points (..., points, 2) from the boundary of a polygon."""
-    edge = (_next(polygon) - polygon)[..., :, None, :]
+    edge = (polygon[..., NEXT, :] - polygon)[..., :, None, :]
     along = points[..., None, :, :] - polygon[..., :, None, :]
     part = ((along * edge).sum(-1) / (edge * edge).sum(-1)).clip(0.0, 1.0)
     away = along - part[..., None] * edge
     return (_least((away * away).sum(-1), -2) + SMALLEST_SQUARE) ** 0.5
-
-
-def signed_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Distance [m] between two polygons, or minus the depth of penetration if they overlap."""
-    gap = separation(first, second)
-    corners = np.minimum(_edge_distance(first, second).min(-1), _edge_distance(second, first).min(-1))
-    return np.where(gap > 0.0, corners, gap)
 
 
 def disc_distance(polygon: Points, centre: Points, radius: Numbers | float) -> Numbers:
@@ -416,66 +405,53 @@ HEADINGS = 72
 Pose: TypeAlias = Float[Array, " components"]
 
 
-def seen_from_above(
-    dynamics: Dynamics, pose: Pose
-) -> tuple[Float[Array, " 2"], Float[Array, " 2"], Float[Array, " 2"]]:
-    """The components x and y of the place, of the heading and of the direction to the left."""
+def frame_of(dynamics: Dynamics, pose: Float[Array, "components *n"]) -> tuple[Vector, Vector, Vector]:
+    """The place, the heading and the direction to the left of a pose, or of many, in the ground's axes."""
     axes = dynamics.surface.axes
     place, heading = padded(pose[:axes]), padded(pose[axes:])
-    left = scale(dynamics.side, cross(dynamics.surface.normal(place), heading))
-    return jnp.stack(place[:2]), jnp.stack(heading[:2]), jnp.stack(left[:2])
+    return place, heading, scale(dynamics.side, cross(dynamics.surface.normal(place), heading))
 
 
-class Chart(eqx.Module):
-    """A flat map of the ground, on which paths are searched: x and y where the ground names its places so, and otherwise a
-    tangent plane, whose points the nearest points of the ground represent. `origin` and the unit vectors `east` and `north`
-    span this plane."""
+def corners_of(dynamics: Dynamics, footprint: Footprint, pose: Float[Array, "components *n"]) -> Points:
+    """The corners [m] of the footprint at a pose, or at many, as seen from above."""
+    return footprint.corners(*(jnp.stack(part[:2], axis=-1) for part in frame_of(dynamics, pose)))
 
-    surface: AbstractSurface
-    origin: Float[Array, " 3"] | None = None
-    east: Float[Array, " 3"] | None = None
-    north: Float[Array, " 3"] | None = None
 
-    @classmethod
-    def tangent(cls, surface: AbstractSurface, side: float, middle: Float[Array, " axes"]) -> "Chart":
-        """A map of the ground near a position in its axes."""
-        position, east, _ = surface.chart(surface.place_at(surface.nearest(padded(middle))))
-        north = scale(side, cross(surface.normal(position), east))
-        zero = jnp.zeros(())
-        columns = [jnp.stack([zero if part is None else zero + part for part in v]) for v in (position, east, north)]
-        return cls(surface, *columns)
+@eqx.filter_jit
+def _pose(scene: Scene, place: tuple[ArrayLike, ...], heading: Float[Array, ""]) -> Pose:
+    position, east, north = scene.surface.chart(place)
+    direction = scene.dynamics.heading.at_angle(heading, east, north)
+    return jnp.stack([*position[: scene.surface.axes], *direction[: scene.surface.axes]])
 
-    def position(self, point: Float[Array, " 2"]) -> Float[Array, " axes"]:
-        """The position [m] of a point of the map, in the ground's axes."""
-        if self.origin is None or self.east is None or self.north is None:
-            place = self.surface.charted((point[0], point[1]))[0]
+
+@eqx.filter_jit
+def _poses_at(
+    surface: AbstractSurface, tangent: Float[Array, "3 3"] | None, points: Float[Array, "n 3"]
+) -> Float[Array, "n components"]:
+    """The poses of points and headings on the map of a problem."""
+
+    def position(point: Float[Array, " 2"]) -> Float[Array, " axes"]:
+        if tangent is None:
+            place = surface.charted((point[0], point[1]))[0]
         else:
-            place = self.surface.nearest(padded(self.origin + point[0] * self.east + point[1] * self.north))
-        return jnp.stack(place[: self.surface.axes])
+            origin, east, north = tangent
+            place = surface.nearest(padded(origin + point[0] * east + point[1] * north))
+        return jnp.stack(place[: surface.axes])
 
-    def point(self, pose: Pose) -> Float[np.ndarray, " 3"]:
-        """The point and the heading (x, y, angle) on the map of a pose."""
-        axes = self.surface.axes
-        place, heading = np.asarray(pose[:axes]), np.asarray(pose[axes:])
-        if self.origin is not None:
-            plane = np.stack([np.asarray(self.east), np.asarray(self.north)])
-            place, heading = plane @ (place - np.asarray(self.origin)), plane @ heading
-        return np.array([place[0], place[1], np.arctan2(heading[1], heading[0])])
+    def pose(point):
+        place, along = jax.jvp(position, (point[:2],), (jnp.stack([jnp.cos(point[2]), jnp.sin(point[2])]),))
+        return jnp.concatenate([place, along / jnp.sqrt(jnp.sum(along**2))])
 
-    @eqx.filter_jit
-    def poses(self, points: Float[Array, "n 3"]) -> Float[Array, "n components"]:
-        """The poses of points and headings on the map."""
-
-        def pose(point):
-            place, along = jax.jvp(self.position, (point[:2],), (jnp.stack([jnp.cos(point[2]), jnp.sin(point[2])]),))
-            return jnp.concatenate([place, along / jnp.sqrt(jnp.sum(along**2))])
-
-        return jax.vmap(pose)(points)
+    return jax.vmap(pose)(points)
 
 
 class Problem(eqx.Module):
     """A planning problem, as the user states it. `t1` is the duration [s] of the drive, or, `in_haste`, where the time is
-    minimised, the longest one."""
+    minimised, the longest one.
+
+    Paths are searched on a flat map of the ground: x and y where the ground names its places so, and otherwise a tangent
+    plane.
+    """
 
     scene: Scene
     launch: Launch
@@ -488,10 +464,7 @@ class Problem(eqx.Module):
 
     def pose(self, place: tuple[ArrayLike, ...], heading: ArrayLike) -> Pose:
         """Position and heading, in the ground's axes, as one array."""
-        surface = self.scene.surface
-        position, east, north = surface.chart(place)
-        direction = self.scene.dynamics.heading.at_angle(jnp.asarray(heading), east, north)
-        return jnp.stack([*position[: surface.axes], *direction[: surface.axes]])
+        return _pose(self.scene, place, jnp.asarray(heading))
 
     @functools.cached_property
     def start_pose(self) -> Pose:
@@ -514,36 +487,47 @@ class Problem(eqx.Module):
         return tuple(self.scene.surface.coordinates) == (("x", "m"), ("y", "m"))
 
     @functools.cached_property
-    def chart(self) -> Chart:
-        """A flat map of the ground."""
-        surface, axes = self.scene.surface, self.scene.surface.axes
+    def tangent(self) -> Float[np.ndarray, "3 3"] | None:
+        """The origin and the unit vectors of the plane whose points stand for the nearest ones of the ground; `None` if the
+        ground names its places x and y."""
         if self.is_flat:
-            return Chart(surface)
-        return Chart.tangent(surface, self.scene.dynamics.side, (self.start_pose[:axes] + self.goal_pose[:axes]) / 2.0)
+            return None
+        surface, axes = self.scene.surface, self.scene.surface.axes
+        middle = (self.start_pose[:axes] + self.goal_pose[:axes]) / 2.0
+        position, east, _ = surface.chart(surface.place_at(surface.nearest(padded(middle))))
+        north = scale(self.scene.dynamics.side, cross(surface.normal(position), east))
+        vectors = [[0.0 if part is None else part for part in vector] for vector in (position, east, north)]
+        return np.array(vectors, dtype=float)
+
+    def point(self, pose: Pose) -> Float[np.ndarray, " 3"]:
+        """The point and the heading (x, y, angle) on the map of a pose."""
+        axes = self.scene.surface.axes
+        place, heading = np.asarray(pose[:axes]), np.asarray(pose[axes:])
+        if self.tangent is not None:
+            origin, plane = self.tangent[0], self.tangent[1:]
+            place, heading = plane @ (place - origin), plane @ heading
+        return np.array([place[0], place[1], np.arctan2(heading[1], heading[0])])
+
+    def poses_at(self, points: Float[np.ndarray, "n 3"]) -> Float[Array, "n components"]:
+        """The poses of points and headings on the map."""
+        tangent = None if self.tangent is None else jnp.asarray(self.tangent)
+        return _poses_at(self.scene.surface, tangent, jnp.asarray(points))
 
     @functools.cached_property
-    def obstacle_arrays(self) -> Obstacles:
-        """The obstacles as arrays."""
-        return Obstacles.of(self.obstacles)
+    def gaps_at_ends(self) -> dict[str, Float[np.ndarray, " obstacles"]]:
+        """The distance [m] of the footprint from every obstacle at the launch and at the goal, negative for an overlap; at the
+        best of all headings if the goal has none."""
+        goal, whole_turn = self.goal, np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
+        headings = whole_turn if goal.heading is None else [goal.heading]
+        poses = [self.start_pose, *(self.pose(goal.place, heading) for heading in headings)]
+        corners = np.asarray(corners_of(self.scene.dynamics, self.footprint, jnp.stack(poses, axis=1)))
+        launch, *goals = np.stack([obstacle.distance(corners) for obstacle in self.obstacles], axis=1)
+        return {"launch": launch, "goal": max(goals, key=np.min)}
 
-    def gaps(self, pose: Pose) -> Float[np.ndarray, " obstacles"]:
-        """The distance [m] of the footprint at a pose from every obstacle, negative for an overlap."""
-        corners = np.asarray(self.footprint.corners(*seen_from_above(self.scene.dynamics, pose)))
-        return np.array([obstacle.distance(corners) for obstacle in self.obstacles])
-
-    def gaps_at_goal(self) -> Float[np.ndarray, " obstacles"]:
-        """The distance [m] from every obstacle at the goal; at the best of all headings if the goal has none."""
-        if self.goal.heading is not None:
-            return self.gaps(self.goal_pose)
-        headings = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
-        return max((self.gaps(self.pose(self.goal.place, heading)) for heading in headings), key=np.min)
-
-    @functools.cached_property
+    @property
     def clearance_at_ends(self) -> float:
         """The distance [m] of the footprint from the obstacles at the start and at the goal; infinite without obstacles."""
-        if not self.obstacles:
-            return np.inf
-        return float(min(self.gaps(self.start_pose).min(), self.gaps_at_goal().min()))
+        return float(min(map(np.min, self.gaps_at_ends.values()))) if self.obstacles else np.inf
 
     @property
     def clearance(self) -> float:
@@ -575,7 +559,7 @@ def checked_problem(
     )
     limits = Limits() if limits is None else limits
     require_kind(limits, "limits", Limits)
-    footprint = Footprint.of(scene.body) if footprint is None else footprint
+    footprint = Footprint(*(part * scene.body.wheelbase for part in DRAWN)) if footprint is None else footprint
     require_kind(footprint, "footprint", Footprint)
     duration = float(np.asarray(t1))
     problem = Problem(scene, launch, goal, duration, require_obstacles(obstacles), limits, footprint, in_haste)
@@ -590,22 +574,16 @@ def checked_problem(
         raise ValueError(
             f"goal: place = {shown(goal.place)} is too far: {away}; plan a long way in stages, goal by goal"
         )
-    _require_limits(problem)
-    _require_free(problem)
-    return problem
-
-
-def _require_limits(problem: Problem) -> None:
-    """Raise `ValueError` if the start or the goal is out of the limits."""
-    launch, goal, ranges = problem.launch, problem.goal, problem.limits.ranges()
     why = "limits; no plan can keep a limit that is broken at its ends"
     for owner, name, value in (
         ("launch", "steering", launch.steering),
         ("launch", "speed", launch.speed),
         ("goal", "speed", goal.speed),
     ):
-        low, high = ranges.get(name, (None, None))
+        low, high = limits.ranges().get(name, (None, None))
         require(value, f"{owner}.{name}", at_least=low, at_most=high, why=why)
+    _require_free(problem)
+    return problem
 
 
 def _require_free(problem: Problem) -> None:
@@ -619,7 +597,7 @@ def _require_free(problem: Problem) -> None:
             f"obstacles: a {type(surface).__name__} names its places ({names}); obstacles need a ground with places "
             "(x [m], y [m]), such as a Plane or a Graph"
         )
-    for name, gaps in (("launch", problem.gaps(problem.start_pose)), ("goal", problem.gaps_at_goal())):
+    for name, gaps in problem.gaps_at_ends.items():
         if gaps.min() <= 0.0:
             nearest = int(np.argmin(gaps))
             place = ", ".join(f"{float(number):g}" for number in getattr(problem, name).place)

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.geometry import AbstractSurface, Plane, cross, scale
+from nonholonomic.geometry import AbstractSurface, Plane
 from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit
 from nonholonomic.validation import require_file, require_package
@@ -18,10 +17,10 @@ from nonholonomic.views import DARK, Body, Mesh, Page, Stage, arena, bar, page
 from nonholonomic.views.plot import new_figure
 from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
-from ..model.dynamics import Dynamics, padded
+from ..model.dynamics import Dynamics
 from ..runs.model import simulate
 from ..runs.trajectory import Trajectory
-from .problem import Box, Disc, Footprint, Limits, Points, Problem, seen_from_above
+from .problem import Box, Disc, Footprint, Limits, Points, Problem, corners_of, frame_of
 from .transcription import Drive
 
 #: Heights of drawn obstacles, and radii of drawn lines, in units of the wheelbase.
@@ -97,7 +96,7 @@ class Plan(eqx.Module):
     def reached(self) -> bool:
         return not self.hindrances
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         units = {name: readable_unit(unit) for name, unit in self.problem.limits.units.items()}
         goal, count = self.problem.goal, len(self.problem.obstacles)
         obstacles = "1 obstacle" if count == 1 else f"{count} obstacles"
@@ -115,9 +114,6 @@ class Plan(eqx.Module):
         ]
         # A run that failed has no end, and no value of what depends on it.
         return "\n".join(line for line in lines if " nan " not in line)
-
-    def __repr__(self) -> str:
-        return str(self)
 
     def plot(self, unit: str | Sequence[str] | None = None) -> Any:
         """Draw the plan from above, or in space on a curved ground: its goal, obstacles, footprint and candidates; and its
@@ -198,9 +194,10 @@ ALLOWED = 1e-3
 
 def checked_drive(problem: Problem, drive: Drive, tolerance: float, times: int) -> Plan:
     """The drive as a plan: its run, with a number of times, what this run achieves, and what stands in the way."""
-    t1 = float(drive.duration)
-    run = simulate(problem.scene, problem.launch, t1, drive, times=np.linspace(0.0, t1, times), tolerance=tolerance)
-    force, torque = map(np.asarray, inputs_of(problem.scene.dynamics, drive, run.t, run.state))
+    t1, scene, goal, axes = float(drive.duration), problem.scene, problem.goal, problem.scene.surface.axes
+    run = simulate(scene, problem.launch, t1, drive, times=np.linspace(0.0, t1, times), tolerance=tolerance)
+    along = seen_along(scene.dynamics, problem.footprint, drive, run.t, run.state)
+    corners, force, torque = map(np.asarray, along)
     values = {"steering": run.steering, "speed": run.speed, "force": force, "torque": torque}
     values["grip"] = run.grip()[:, : len(run.loaded_axles)]
     ranges, units = problem.limits.ranges(), {name: readable_unit(unit) for name, unit in Limits.units.items()}
@@ -208,7 +205,10 @@ def checked_drive(problem: Problem, drive: Drive, tolerance: float, times: int) 
         name: float(min(np.min(values[name]) - low, high - np.max(values[name])))
         for name, (low, high) in ranges.items()
     }
-    errors, (clearance, nearest) = errors_of(run, problem), clearance_of(run, problem)
+    clearance, nearest = clearance_of(problem, np.asarray(run.t), corners)
+    away = np.asarray(run.state)[-1, : 2 * axes] - np.asarray(problem.goal_pose)
+    turn = 0.0 if goal.heading is None else 2.0 * np.arcsin(np.minimum(1.0, 0.5 * np.linalg.norm(away[axes:])))
+    errors = float(np.linalg.norm(away[:axes])), float(turn), abs(float(run.speed[-1]) - float(goal.speed))
     within, length = float(problem.goal.within), float(problem.footprint.length)
     # What is wrong, each relative to what is allowed, and the words for it.
     wrong = [
@@ -234,22 +234,27 @@ def checked_drive(problem: Problem, drive: Drive, tolerance: float, times: int) 
     return Plan(drive, run, problem, clearance, margins, effort, errors, hindrances, excess, np.zeros((0, 0, 3)))
 
 
-def errors_of(run: Trajectory, problem: Problem) -> tuple[float, float, float]:
-    """The errors at the end: of the place [m], of the heading [rad] and of the speed [m/s]."""
-    goal, axes = problem.goal, problem.scene.surface.axes
-    away = np.asarray(run.state[-1, : 2 * axes]) - np.asarray(problem.goal_pose)
-    turn = 0.0 if goal.heading is None else 2.0 * np.arcsin(np.minimum(1.0, 0.5 * np.linalg.norm(away[axes:])))
-    return float(np.linalg.norm(away[:axes])), float(turn), abs(float(run.speed[-1]) - float(goal.speed))
+@eqx.filter_jit
+def seen_along(
+    dynamics: Dynamics,
+    footprint: Footprint,
+    drive: Drive,
+    times: Float[Array, " times"],
+    states: Float[Array, "times n"],
+) -> tuple[Points, Float[Array, " times"], Float[Array, " times"]]:
+    """The corners [m] of the footprint, the force [N] and the torque [N m] of a drive along a run."""
+    corners = corners_of(dynamics, footprint, states.T[: 2 * dynamics.surface.axes])
+    return corners, *drive(times, dynamics.geometry(states.T).motion)
 
 
-def clearance_of(run: Trajectory, problem: Problem) -> tuple[float, int]:
+def clearance_of(
+    problem: Problem, times: Float[np.ndarray, " times"], corners: Float[np.ndarray, "times 4 2"]
+) -> tuple[float, int]:
     """The least distance [m] between the footprint and an obstacle, negative for an overlap, and the obstacle's number;
     infinite without obstacles."""
     if not problem.obstacles:
         return np.inf, -1
-    corners = np.asarray(corners_of(problem.scene.dynamics, problem.footprint, run.state))
     coarse = np.stack([obstacle.distance(corners) for obstacle in problem.obstacles], axis=-1)
-    times = np.asarray(run.t)
     # Between two times, no corner moves further than this.
     moved = np.linalg.norm(np.diff(corners, axis=0), axis=-1).max(axis=-1)
     lower = np.minimum(coarse[:-1], coarse[1:]) - moved[:, None]
@@ -262,21 +267,6 @@ def clearance_of(run: Trajectory, problem: Problem) -> tuple[float, int]:
         if fine < least:
             least, nearest = fine, number
     return float(least), nearest
-
-
-@eqx.filter_jit
-def corners_of(dynamics: Dynamics, footprint: Footprint, states: Float[Array, "times components"]) -> Points:
-    """The corners [m] of the footprint at the states of a run, seen from above."""
-    axes = dynamics.surface.axes
-    return jax.vmap(lambda state: footprint.corners(*seen_from_above(dynamics, state[: 2 * axes])))(states)
-
-
-@eqx.filter_jit
-def inputs_of(
-    dynamics: Dynamics, drive: Drive, times: Float[Array, " times"], states: Float[Array, "times components"]
-) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
-    """The force [N] and the torque [N m] of a drive along a run."""
-    return jax.vmap(lambda t, state: drive(t, dynamics.geometry(state).motion))(times, states)
 
 
 # The parts of pictures.
@@ -331,9 +321,7 @@ def outlines(
 ) -> Float[np.ndarray, "poses 4 3"]:
     """The corners [m] of a footprint on the ground, or above it, in the fixed frame."""
     dynamics, surface = problem.scene.dynamics, problem.scene.surface
-    place, heading = padded(poses.T[: surface.axes]), padded(poses.T[surface.axes :])
-    left = scale(dynamics.side, cross(surface.normal(place), heading))
-    flat = footprint.corners(*(fixed(surface, part) for part in (place, heading, left)))
+    flat = footprint.corners(*(fixed(surface, part) for part in frame_of(dynamics, poses.T)))
     ground = surface.nearest(own(surface, np.moveaxis(np.asarray(flat), -1, 0)))
     return fixed(surface, ground) + raised * dynamics.side * fixed(surface, surface.normal(ground))
 

@@ -11,12 +11,11 @@ from itertools import product
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from .problem import FAR, Footprint, Limits, Numbers, Obstacles, Problem
+from .problem import FAR, Footprint, Numbers, Obstacles, Problem
 from .transcription import LIMIT_RESERVE, ORDER
 
 # The region of a search, and what the stroller may do there.
@@ -71,11 +70,13 @@ class Costs(NamedTuple):
 
 
 class Ground(NamedTuple):
-    """The region of a search: lower corner and size (2,) [m], side of a cell [m], and what must not be touched."""
+    """The region of a search: lower corner and size (2,) [m], side of a cell [m], cells in each direction, and what must not
+    be touched."""
 
     low: Float[np.ndarray, " 2"]
     size: Float[np.ndarray, " 2"]
     cell: float
+    shape: tuple[int, int]
     obstacles: Obstacles
     footprint: Footprint
 
@@ -92,19 +93,13 @@ class Ground(NamedTuple):
         reach = max(2.5 * float(footprint.length), TURNING_SPACE * radius)
         low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
         cell = max(0.2 * float(footprint.length), float((high - low).max()) / MOST_CELLS)
-        return cls(low, high - low, cell, obstacles, footprint)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """The number of cells in each direction."""
-        nx, ny = np.ceil(self.size / self.cell).astype(int) + 1
-        return nx, ny
+        nx, ny = np.ceil((high - low) / cell).astype(int) + 1
+        return cls(low, high - low, cell, (int(nx), int(ny)), obstacles, footprint)
 
     def places(self, points: Float[np.ndarray, "*n 2"]) -> tuple[Int[np.ndarray, "*n"], Int[np.ndarray, "*n"]]:
         """The cells of points, in x and y."""
         x, y = np.moveaxis(((points - self.low) / self.cell).astype(int), -1, 0)
-        nx, ny = self.shape
-        return x.clip(0, nx - 1), y.clip(0, ny - 1)
+        return x.clip(0, self.shape[0] - 1), y.clip(0, self.shape[1] - 1)
 
     def cells(self, poses: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
         """The numbers of the cells of places, headings and directions of travel."""
@@ -116,8 +111,6 @@ class Ground(NamedTuple):
         """Whether the footprint is inside the region and keeps its distance from all obstacles."""
         place = poses[..., :2] - self.low
         free = np.all((place >= 0.0) & (place <= self.size), axis=-1)
-        if not len(self.obstacles.boxes) and not len(self.obstacles.radii):
-            return free
         forward = np.stack([np.cos(poses[..., 2]), np.sin(poses[..., 2])], axis=-1)
         length = float(self.footprint.length)
         centre = poses[..., :2] + (length / 2.0 - float(self.footprint.rear)) * forward
@@ -126,7 +119,7 @@ class Ground(NamedTuple):
         forward = forward[close]
         left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
         corners = self.footprint.corners(poses[close][:, :2], forward, left)
-        free[close] &= self.obstacles.gaps(corners).min(axis=-1) > clearance
+        free[close] &= self.obstacles.gaps(corners).min(axis=-1, initial=np.inf) > clearance
         return free
 
     def distance(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
@@ -170,7 +163,7 @@ class Steps(NamedTuple):
     @classmethod
     def of(cls, problem: Problem, share: float) -> "Steps":
         """What the limits of speed and steering angle, of whose curvature only a share is used, allow a search."""
-        angles = Limits(steering=problem.limits.steering).arrays(LIMIT_RESERVE)
+        angles = problem.limits.arrays(LIMIT_RESERVE)
         low, high = (float(np.tan(angle[0])) / float(problem.scene.body.wheelbase) for angle in angles)
         slowest, fastest = problem.limits.ranges().get("speed", (-np.inf, np.inf))
         directions = tuple(sign for sign, speed in ((1.0, fastest), (-1.0, -slowest)) if speed > 0.0)
@@ -247,18 +240,9 @@ def shortcuts(
     return np.array(pieces).reshape(len(pieces), 3, 3, len(poses)).transpose(1, 2, 0, 3)
 
 
-class Nodes(NamedTuple):
-    """Nodes of a search: poses (nodes, 3), costs [m], numbers of the parents, and the moves (nodes, 3) that led from these,
-    each a direction of travel, a curvature and a length."""
-
-    pose: Float[np.ndarray, "nodes 3"]
-    cost: Float[np.ndarray, " nodes"]
-    parent: Int[np.ndarray, " nodes"]
-    move: Float[np.ndarray, "nodes 3"]
-
-    def only(self, which: np.ndarray) -> "Nodes":
-        """Some of the nodes."""
-        return Nodes(*(part[which] for part in self))
+#: A node of a search: its pose (3,), its cost [m], the number of its parent, and the move (3,) that led from there: a direction
+#: of travel, a curvature and a length.
+NODE = np.dtype([("pose", float, 3), ("cost", float), ("parent", int), ("move", float, 3)])
 
 
 class Search:
@@ -278,8 +262,8 @@ class Search:
         self.first_moves = np.concatenate([arcs * [1.0, 1.0, times] for times in range(FIRST_ARCS)])
         self.moves, self.way = arcs, ground.way_to(goal[:2], costs.clearance)
         most = MOST_NODES + max(BATCH * len(arcs), len(self.first_moves))
-        self.tree = Nodes(np.zeros((most, 3)), np.zeros(most), np.zeros(most, dtype=int), np.zeros((most, 3)))
-        self.tree.pose[0], self.count = start, 1
+        self.tree, self.count = np.zeros(most, NODE), 1
+        self.tree["pose"][0] = start
         self.best = np.full(np.prod(ground.shape) * HEADINGS * 2, np.inf)
         self.path, self.least = None, np.inf
         self.nearest = float(np.linalg.norm(start[:2] - goal[:2]))
@@ -291,55 +275,55 @@ class Search:
         frontier, tree, ground = [(0.0, 0)], self.tree, self.ground
         while frontier and frontier[0][0] < self.least - TIE and self.count < MOST_NODES:
             nodes = np.array([heapq.heappop(frontier)[1] for _ in range(min(BATCH, len(frontier)))])
-            cells = ground.cells(tree.pose[nodes], tree.move[nodes, 0])
+            cells = ground.cells(tree["pose"][nodes], tree["move"][nodes, 0])
             # A cheaper node of the same cell has replaced the others. The start has no cell.
-            nodes = nodes[(nodes == 0) | (tree.cost[nodes] <= self.best[cells] + TIE)]
+            nodes = nodes[(nodes == 0) | (tree["cost"][nodes] <= self.best[cells] + TIE)]
             if not nodes.size:
                 continue
             children, numbers = self.expanded(nodes)
-            away = np.linalg.norm(children.pose[:, :2] - self.goal[:2], axis=-1)
-            turn = np.abs((children.pose[:, 2] - self.goal[2] + np.pi) % (2.0 * np.pi) - np.pi) * self.has_heading
+            poses, cost = children["pose"], children["cost"]
+            away = np.linalg.norm(poses[:, :2] - self.goal[:2], axis=-1)
+            turn = np.abs((poses[:, 2] - self.goal[2] + np.pi) % (2.0 * np.pi) - np.pi) * self.has_heading
             self.nearest = float(away.min(initial=self.nearest))
             arrived = (away < ARRIVAL[0] * ground.cell) & (turn < ARRIVAL[1] * 2.0 * np.pi / HEADINGS)
             if arrived.any():
-                missing = children.cost + away + turn / self.steps.sharpest
+                missing = cost + away + turn / self.steps.sharpest
                 return self.path_by(int(numbers[arrived][np.argmin(missing[arrived])]), np.zeros((0, 3))), 0.0, True
-            ahead = np.maximum(self.way[ground.places(children.pose[:, :2])], self.cut_short(children, numbers))
-            for entry in zip((children.cost + ahead).tolist(), numbers.tolist(), strict=True):
+            ahead = np.maximum(self.way[ground.places(poses[:, :2])], self.cut_short(children, numbers))
+            for entry in zip((cost + ahead).tolist(), numbers.tolist(), strict=True):
                 heapq.heappush(frontier, entry)
         return self.path, self.nearest, not frontier
 
-    def expanded(self, nodes: Int[np.ndarray, " nodes"]) -> tuple[Nodes, Int[np.ndarray, " children"]]:
+    def expanded(self, nodes: Int[np.ndarray, " nodes"]) -> tuple[np.ndarray, Int[np.ndarray, " children"]]:
         """The new nodes at the ends of all moves from some nodes: those that touch no obstacle, have a way to the goal, and
         are the cheapest in their cells; and their numbers in the tree."""
         ground, tree, moves = self.ground, self.tree, self.first_moves if nodes[0] == 0 else self.moves
         parent, move = np.repeat(nodes, len(moves)), np.tile(moves, (len(nodes), 1))
-        poses = self.along(tree.pose[parent], move)
-        children = Nodes(poses[:, -1], tree.cost[parent] + self.price(tree.move[parent].T, move.T), parent, move)
-        children = children.only(np.asarray(ground.is_free(poses, self.costs.clearance).all(axis=1)))
-        cells = ground.cells(children.pose, children.move[:, 0])
-        order = np.lexsort((children.cost, cells))
+        poses = self.along(tree["pose"][parent], move)
+        children = np.zeros(len(parent), NODE)
+        children["pose"], children["parent"], children["move"] = poses[:, -1], parent, move
+        children["cost"] = tree["cost"][parent] + self.price(tree["move"][parent].T, move.T)
+        children = children[np.asarray(ground.is_free(poses, self.costs.clearance).all(axis=1))]
+        cells = ground.cells(children["pose"], children["move"][:, 0])
+        order = np.lexsort((children["cost"], cells))
         kept = order[np.unique(cells[order], return_index=True)[1]]
-        has_way = np.isfinite(self.way[ground.places(children.pose[kept, :2])])
-        kept = kept[(children.cost[kept] < self.best[cells[kept]] - TIE) & has_way]
-        self.best[cells[kept]] = children.cost[kept]
-        children = children.only(kept)
-        numbers = np.arange(self.count, self.count + len(kept))
-        for part, added in zip(tree, children, strict=True):
-            part[numbers] = added
+        has_way = np.isfinite(self.way[ground.places(children["pose"][kept, :2])])
+        kept = kept[(children["cost"][kept] < self.best[cells[kept]] - TIE) & has_way]
+        children, numbers = children[kept], np.arange(self.count, self.count + len(kept))
+        self.best[cells[kept]], tree[numbers] = children["cost"], children
         self.count += len(kept)
         return children, numbers
 
-    def cut_short(self, children: Nodes, numbers: Int[np.ndarray, " children"]) -> Float[np.ndarray, " children"]:
+    def cut_short(self, children: np.ndarray, numbers: Int[np.ndarray, " children"]) -> Float[np.ndarray, " children"]:
         """Look for a cheaper path to the goal by shortcuts from new nodes, and return the least price [m] of a shortcut from
         each, 0 where there is none."""
-        ways = shortcuts(children.pose, self.goal, self.has_heading, self.steps)
-        price, before = np.zeros(ways.shape[2:]), children.move.T[:, None]
+        ways = shortcuts(children["pose"], self.goal, self.has_heading, self.steps)
+        price, before = np.zeros(ways.shape[2:]), children["move"].T[:, None]
         for move in ways:
             price += self.price(before, move)
             before = np.where(move[2] > TIE, move, before)
         price = np.nan_to_num(price, nan=np.inf)
-        total = children.cost + price
+        total = children["cost"] + price
         for number in np.argsort(total, axis=None)[:EXAMINED]:
             which, child = np.unravel_index(number, total.shape)
             if total[which, child] >= self.least:
@@ -369,10 +353,10 @@ class Search:
         """The path to a node, and by more pieces from there."""
         branch = [node]
         while branch[-1]:
-            branch.append(int(self.tree.parent[branch[-1]]))
+            branch.append(int(self.tree["parent"][branch[-1]]))
         branch = branch[::-1]
-        poses = list(self.tree.pose[branch])
-        moves = np.concatenate([self.tree.move[branch[1:]], more[more[:, 2] > TIE]])
+        poses = list(self.tree["pose"][branch])
+        moves = np.concatenate([self.tree["move"][branch[1:]], more[more[:, 2] > TIE]])
         for piece in moves[len(branch) - 1 :]:
             poses.append(driven(poses[-1], *piece))
         return Path(np.array(poses), *moves.T)
@@ -419,9 +403,9 @@ def prices(problem: Problem, count: int, batch: int, rng: np.random.Generator) -
 def paths_of(problem: Problem, costs: list[Costs]) -> tuple[list[Path], str | None]:
     """A path for each of several prices, straight to the goal where the search finds none; and a reason, in words, why
     none can be driven in time, if there is one."""
-    start, goal = problem.chart.point(problem.start_pose), problem.chart.point(problem.goal_pose)
+    start, goal = problem.point(problem.start_pose), problem.point(problem.goal_pose)
     radius = 1.0 / Steps.of(problem, min(SEARCH_CURVATURES)).sharpest
-    ground = Ground.of(np.stack([start, goal]), problem.obstacle_arrays, problem.footprint, radius)
+    ground = Ground.of(np.stack([start, goal]), Obstacles.of(problem.obstacles), problem.footprint, radius)
     has_heading = problem.goal.heading is not None
     results = [
         Search(ground, start, goal, has_heading, Steps.of(problem, SEARCH_CURVATURES[lane % 2]), prices).run()
@@ -444,27 +428,25 @@ def paths_of(problem: Problem, costs: list[Costs]) -> tuple[list[Path], str | No
     return [path or paths[0] for path, _, _ in results], reason
 
 
-def soonest(problem: Problem, path: Path) -> float:
-    """A time [s] that a path takes at least, by the limits of speed, force, grip and torque."""
-    scene, body = problem.scene, problem.scene.body
-    way = max(float(path.length.sum()), float(body.wheelbase))
-    most = {name: max(-low, high) for name, (low, high) in problem.limits.ranges().items()}
-    # The way from rest to rest with the greatest acceleration, and a turn of the wheel by 1 rad in the same manner.
-    accelerations = [most.get("force", np.inf) / body.mass, most.get("grip", np.inf) * scene.gravity]
-    slowest = [way / accelerations[0], way / accelerations[1], body.steering_inertia / most.get("torque", np.inf)]
-    return max(way / most.get("speed", np.inf), 2.0 * float(np.sqrt(max(slowest))))
-
-
-def unknowns_of(problem: Problem, path: Path, t1: float) -> Float[np.ndarray, "rows unknowns"]:
-    """A path, driven within `t1` [s], as unknowns of the optimiser (see `transcription.py`)."""
-    wheelbase = float(problem.scene.body.wheelbase)
+def guess_of(problem: Problem, path: Path) -> tuple[Float[np.ndarray, "rows unknowns"], float]:
+    """A path as unknowns of the optimiser (see `transcription.py`), and the duration [s] of its drive: the given one, or, in
+    haste, the time that the path takes at least, by the limits of speed, force, grip and torque."""
+    scene, body, t1 = problem.scene, problem.scene.body, problem.t1
+    wheelbase = float(body.wheelbase)
+    if problem.in_haste:
+        way = max(float(path.length.sum()), wheelbase)
+        most = {name: max(-low, high) for name, (low, high) in problem.limits.ranges().items()}
+        # The way from rest to rest with the greatest acceleration, and a turn of the wheel by 1 rad in the same manner.
+        accelerations = [most.get("force", np.inf) / body.mass, most.get("grip", np.inf) * scene.gravity]
+        slowest = [way / accelerations[0], way / accelerations[1], body.steering_inertia / most.get("torque", np.inf)]
+        t1 = max(way / most.get("speed", np.inf), 2.0 * float(np.sqrt(max(slowest))))
     points, speed, curvature = timed(path, INTERVALS + 1, t1, wheelbase)
     steering = smoothed(np.arctan(wheelbase * curvature), SMOOTHING[0])
     front_speed = smoothed(speed, SMOOTHING[1]) / np.cos(steering)
-    poses = np.asarray(problem.chart.poses(jnp.asarray(points)))
+    poses = np.asarray(problem.poses_at(points))
     poses = np.concatenate([poses, poses[-1:], poses[-1:]])
     splines = np.pad(np.stack([steering, front_speed], axis=1), ((1, ORDER - 3), (0, 0)), mode="edge")
-    return np.concatenate([poses, splines], axis=1)
+    return np.concatenate([poses, splines], axis=1), t1
 
 
 def smoothed(values: Float[np.ndarray, " n"], width: int) -> Float[np.ndarray, " n"]:
@@ -484,7 +466,12 @@ def timed(
     ends = np.concatenate([[0.0], np.cumsum(shares)])
     time = np.linspace(0.0, 1.0, knots)
     section = np.clip(np.searchsorted(ends, time, side="right") - 1, 0, len(lengths) - 1)
-    way, rate = progress((time - ends[section]) / shares[section])
+    # The share of a section's length, and its rate: smooth ramps, and constant speed between.
+    part, top = (time - ends[section]) / shares[section], 1.0 / (1.0 - RAMP)
+    up, down = np.clip(part / RAMP, 0.0, 1.0), np.clip((1.0 - part) / RAMP, 0.0, 1.0)
+    ramps = RAMP * (up**3 - 0.5 * up**4) + RAMP * (0.5 - (down**3 - 0.5 * down**4))
+    way = top * (ramps + np.clip(part, RAMP, 1.0 - RAMP) - RAMP)
+    rate = top * np.minimum(3.0 * up**2 - 2.0 * up**3, 3.0 * down**2 - 2.0 * down**3)
     start = np.array([path.length[:cut].sum() for cut in cuts])
     along = start[section] + way * lengths[section]
     piece_ends = np.cumsum(path.length)
@@ -493,14 +480,3 @@ def timed(
     poses = driven(path.poses[piece], path.direction[piece], path.curvature[piece], into)
     speed = rate * lengths[section] / (shares[section] * t1)
     return poses, speed * path.direction[piece], path.curvature[piece]
-
-
-def progress(part: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Share of a section's length, and its rate, at a share of its time: smooth ramps and constant speed between."""
-    top = 1.0 / (1.0 - RAMP)
-    ramp = lambda u: u**3 - 0.5 * u**4  # noqa: E731
-    slope = lambda u: 3.0 * u**2 - 2.0 * u**3  # noqa: E731
-    u, v = np.clip(part / RAMP, 0.0, 1.0), np.clip((1.0 - part) / RAMP, 0.0, 1.0)
-    middle = np.clip(part, RAMP, 1.0 - RAMP) - RAMP
-    way = top * (RAMP * ramp(u) + middle + RAMP * (0.5 - ramp(v)))
-    return way, top * np.minimum(slope(u), slope(v))

@@ -22,11 +22,12 @@ from nonholonomic.geometry import Vector, add, dot, multiply, scale, subtract
 
 from ..model.dynamics import Dynamics, padded
 from ..model.input import Motion
-from .problem import Footprint, Obstacles, Pose, Problem, seen_from_above
+from .problem import Footprint, Obstacles, Pose, Problem, corners_of
 
-#: Numbers in JAX; and coefficients of the splines of the steering angle and of the front wheel's speed.
+#: Numbers in JAX; and coefficients of the splines of the steering angle and of the front wheel's speed, all or those of an
+#: interval.
 Numbers: TypeAlias = Float[Array, "..."]
-Splines: TypeAlias = tuple[Numbers, Numbers]
+Splines: TypeAlias = Float[Array, "rows 2"]
 
 # Inverse dynamics: the force and the torque that move the stroller with a given speed and steering angle.
 #
@@ -193,7 +194,7 @@ class Task(eqx.Module):
         return cls(
             dynamics=problem.scene.dynamics,
             footprint=problem.footprint,
-            obstacles=problem.obstacle_arrays,
+            obstacles=Obstacles.of(problem.obstacles),
             start=(problem.start_pose, launch.steering, launch.steering_rate, launch.speed / jnp.cos(launch.steering)),
             goal=(problem.goal_pose, goal.speed),
             has_heading=jnp.asarray(0.0 if goal.heading is None else 1.0),
@@ -220,11 +221,10 @@ def drive_from(
     dynamics: Dynamics, pose: Pose, window: Splines, part: Numbers | float, step: float, duration: Numbers
 ) -> Pose:
     """The pose a step later, by the classical Runge-Kutta method; `part` and `step` in units of the interval."""
-    steering, speed = window
 
     def rate(u: Numbers | float, pose: Pose) -> Pose:
-        weights = basis(u)[0]
-        state = state_of(dynamics, pose, weighted(weights, steering), jnp.zeros(()), weighted(weights, speed))
+        steering, front_speed = weighted(basis(u)[0], window)
+        state = state_of(dynamics, pose, steering, jnp.zeros(()), front_speed)
         return duration * dynamics.field(jnp.zeros(()), state)[: len(pose)]
 
     k1 = rate(part, pose)
@@ -236,14 +236,9 @@ def drive_from(
 
 def motion_at(window: Splines, part: Numbers | float, duration: Numbers) -> Rates:
     """The steering and the speed at a part of an interval that takes `duration` [s]."""
-    (steering, speed), (value, slope, bend) = window, basis(part)
-    return Rates(
-        weighted(value, steering),
-        weighted(slope, steering) / duration,
-        weighted(bend, steering) / duration**2,
-        weighted(value, speed),
-        weighted(slope, speed) / duration,
-    )
+    value, slope, bend = (weighted(weights, window) for weights in basis(part))
+    rate, acceleration = slope / duration, bend[..., 0] / duration**2
+    return Rates(value[..., 0], rate[..., 0], acceleration, value[..., 1], rate[..., 1])
 
 
 def point_residuals(task: Task, pose: Pose, motion: Rates) -> tuple[Float[Array, " inequalities"], Float[Array, " 2"]]:
@@ -252,7 +247,7 @@ def point_residuals(task: Task, pose: Pose, motion: Rates) -> tuple[Float[Array,
     values = jnp.stack([motion.steering, needed.speed, needed.force, needed.torque])
     units = jnp.stack([1.0, task.speed, task.force, task.force * task.length])
     within = [(values - task.low[:4]) / units, (task.high[:4] - values) / units, task.high[4] - needed.grip]
-    corners = task.footprint.corners(*seen_from_above(task.dynamics, pose))
+    corners = corners_of(task.dynamics, task.footprint, pose)
     gaps = (task.obstacles.gaps(corners) - task.clearance) / task.length
     weight = task.dynamics.body.mass * task.dynamics.gravity
     contact = needed.normal_force / jnp.maximum(weight, task.force) - LEAST_CONTACT * (weight > 0.0)
@@ -264,7 +259,7 @@ def interval_residuals(
     window: Float[Array, "4 unknowns"], task: Task, index: Int[Array, ""], intervals: int, duration: Numbers
 ) -> Residuals:
     """All residuals of the interval `index` of `intervals`."""
-    poses, splines = window[:, :-2], (window[:, -2], window[:, -1])
+    poses, splines = window[:, :-2], window[:, -2:]
     is_last = index == intervals - 1
 
     def step(pose, k):
@@ -276,7 +271,7 @@ def interval_residuals(
     # No interval follows the last one.
     first, last = motion_at(splines, 0.0, duration), motion_at(splines, 1.0, duration)
     at_end, _ = point_residuals(task, end, last)
-    between = motion_at(splines, jnp.asarray(BETWEEN), duration)
+    between = motion_at(splines, jnp.asarray(BETWEEN)[:, None], duration)
     values = jnp.stack([between.steering, between.front_speed * jnp.cos(between.steering)], axis=-1)
     within = jnp.concatenate([values - task.low[:2], task.high[:2] - values]) / jnp.stack([1.0, task.speed])
     inequalities = jnp.concatenate([inequalities.ravel(), jnp.where(is_last, at_end, 1.0), within.ravel()])
@@ -290,8 +285,7 @@ def interval_residuals(
     ends = [last.steering_rate * duration, (last.front_speed * jnp.cos(last.steering) - goal_speed) / task.speed]
     equalities = [(poses[1] - end) / units, at_start * (poses[0] - pose) / units, at_start * jnp.stack(starts)]
     equalities += [at_goal * away, at_goal * jnp.stack(ends)]
-    bends = splines[0][2] - 2.0 * splines[0][1] + splines[0][0], splines[1][2] - 2.0 * splines[1][1] + splines[1][0]
-    smooth = SMOOTHNESS * jnp.stack([bends[0], bends[1] / task.speed])
+    smooth = SMOOTHNESS * (splines[2] - 2.0 * splines[1] + splines[0]) / jnp.stack([1.0, task.speed])
     objective = jnp.concatenate([effort.ravel() / jnp.sqrt(STEPS * intervals), smooth])
     objective = jnp.where(task.haste > 0.0, EASE, 1.0) * objective
     return Residuals(jnp.concatenate(equalities), inequalities, objective)
@@ -329,84 +323,74 @@ class Candidates(NamedTuple):
 CALM, HASTY = ((100.0, 300.0, *(1e3,) * 6), 8, 0.02), ((10.0, *(30.0,) * 15), 60, 2e-3)
 
 
-class Multipliers(NamedTuple):
-    """Multipliers in units of the penalty, shaped as the constraints."""
+class Equations(NamedTuple):
+    """The equations of a Gauss-Newton step in every lane: the merit (lanes,), its gradient, the lower band of the matrix
+    without its last row, and this row; and the residuals of all intervals."""
 
-    equalities: Numbers
-    inequalities: Numbers
+    merit: Float[Array | np.ndarray, " lanes"]
+    gradient: Float[Array | np.ndarray, "lanes unknowns"]
+    band: Float[Array | np.ndarray, "lanes band others"]
+    edge: Float[Array | np.ndarray, "lanes unknowns"]
+    residuals: Residuals
+
+
+#: Multipliers of the equalities and of the inequalities, in units of the penalty, shaped as the residuals.
+Multipliers: TypeAlias = tuple[
+    Float[Array | np.ndarray, "lanes intervals _"], Float[Array | np.ndarray, "lanes intervals _"]
+]
 
 
 @eqx.filter_jit
-def _normal_equations(
-    candidates: Candidates, task: Task, multipliers: Multipliers, penalty: Numbers
-) -> tuple[Numbers, Numbers, Numbers, Numbers]:
-    """Merit (lanes,), gradient, lower band of the Gauss-Newton matrix without its last row, and this row, of every lane.
+def _equations(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: Numbers) -> Equations:
+    """The equations of a step from some candidates.
 
     The last of the unknowns is the logarithm of the factor of the duration; the speeds change inversely to it, so that the
     path stays.
     """
+    _, rows, width = candidates.unknowns.shape
+    intervals, root = rows - ORDER + 1, jnp.sqrt(penalty)
+    # The poses of the third and the fourth row of a window have no influence.
+    used = np.array([k for k in range(ORDER * width) if k < 2 * width or k % width >= width - 2])
+
+    def of_interval(window, t1, multipliers, index):
+        def terms(numbers):
+            duration = t1 * jnp.exp(jnp.where(task.haste > 0.0, numbers[-1], 0.0))
+            changed = window.ravel().at[used].set(numbers[:-1]).reshape(window.shape)
+            changed = changed.at[:, -1].multiply(t1 / duration)
+            residuals = interval_residuals(changed, task, index, intervals, duration / intervals)
+            shifted = residuals.inequalities + multipliers[1]
+            broken = root * jnp.where(shifted < 0.0, shifted, 0.0)
+            missed = root * (residuals.equalities + multipliers[0])
+            time = task.haste * duration / jnp.sqrt(intervals)
+            value = jnp.concatenate([missed, broken, residuals.objective, time[None]])
+            return value, (value, residuals)
+
+        slope, (value, residuals) = jax.jacfwd(terms, has_aux=True)(jnp.append(window.ravel()[used], 0.0))
+        return value @ value, slope.T @ value, slope.T @ slope, residuals
 
     def of_lane(unknowns, t1, multipliers):
-        rows, width = unknowns.shape
-        intervals = rows - ORDER + 1
-
-        root = jnp.sqrt(penalty)
-
-        # The poses of the third and the fourth row of a window have no influence.
-        used = np.array([k for k in range(ORDER * width) if k < 2 * width or k % width >= width - 2])
-
-        def of_interval(window, multipliers, index):
-            def terms(numbers):
-                duration = t1 * jnp.exp(jnp.where(task.haste > 0.0, numbers[-1], 0.0))
-                changed = window.ravel().at[used].set(numbers[:-1]).reshape(window.shape)
-                changed = changed.at[:, -1].multiply(t1 / duration)
-                evaluation = interval_residuals(changed, task, index, intervals, duration / intervals)
-                shifted = evaluation.inequalities + multipliers.inequalities
-                broken = root * jnp.where(shifted < 0.0, shifted, 0.0)
-                missed = root * (evaluation.equalities + multipliers.equalities)
-                time = task.haste * duration / jnp.sqrt(intervals)
-                value = jnp.concatenate([missed, broken, evaluation.objective, time[None]])
-                return value, value
-
-            slope, value = jax.jacfwd(terms, has_aux=True)(jnp.append(window.ravel()[used], 0.0))
-            return value @ value, slope.T @ value, slope.T @ slope
-
-        merit, gradient, matrix = jax.vmap(of_interval)(windows(unknowns), multipliers, jnp.arange(intervals))
+        of_all = jax.vmap(of_interval, (0, None, 0, 0))
+        merit, gradient, matrix, residuals = of_all(windows(unknowns), t1, multipliers, jnp.arange(intervals))
         number = np.arange(intervals)[:, None] * width + used
         number = np.append(number, np.full((intervals, 1), rows * width), axis=1)
         total, edge = (jnp.zeros(rows * width + 1).at[number].add(part) for part in (gradient, matrix[:, -1]))
         row, column = np.tril_indices(len(used))
         band = jnp.zeros((ORDER * width, rows * width))
         band = band.at[(used[row] - used[column])[None], number[:, column]].add(matrix[:, row, column])
-        return merit.sum(), total, band, edge
+        return Equations(merit.sum(), total, band, edge, residuals)
 
     return jax.vmap(of_lane)(*candidates, multipliers)
 
 
-@eqx.filter_jit
-def residuals(candidates: Candidates, task: Task) -> Residuals:
-    """The residuals of all intervals of every lane."""
-    intervals = candidates.unknowns.shape[1] - ORDER + 1
-
-    def of_lane(unknowns, t1):
-        def of_one(window, index):
-            return interval_residuals(window, task, index, intervals, t1 / intervals)
-
-        return jax.vmap(of_one)(windows(unknowns), jnp.arange(intervals))
-
-    return jax.vmap(of_lane)(*candidates)
-
-
-def _step(equations: list[np.ndarray], damping: np.ndarray) -> np.ndarray:
+def _step(equations: Equations, damping: Float[np.ndarray, " lanes"]) -> Float[np.ndarray, "lanes unknowns"]:
     """Damped Gauss-Newton steps of all lanes, solved as one banded system; none in a lane that is not finite."""
-    gradient, band, edge = equations
-    lanes, width, count = band.shape
-    usable = np.all(np.isfinite(band), axis=(1, 2), keepdims=True)
-    matrix = np.where(usable, band, 0.0)
+    lanes, width, count = equations.band.shape
+    usable = np.all(np.isfinite(equations.band), axis=(1, 2), keepdims=True)
+    matrix = np.where(usable, equations.band, 0.0)
     # Rounding must not make the matrix indefinite where an unknown far from the others has a very steep residual.
     matrix[:, 0] += damping[:, None] + 1e-12 + 1e-13 * matrix[:, 0].max(axis=1, keepdims=True)
-    joined, sides = matrix.transpose(1, 0, 2).reshape(width, lanes * count), np.stack([gradient, edge], axis=-1)
-    sides = np.where(usable, sides, 0.0)
+    joined = matrix.transpose(1, 0, 2).reshape(width, lanes * count)
+    sides = np.where(usable, np.stack([equations.gradient, equations.edge], axis=-1), 0.0)
     solved = scipy.linalg.solveh_banded(joined, sides[:, :-1].reshape(-1, 2), lower=True).reshape(lanes, count, 2)
     # The last unknown follows from the Schur complement of the others.
     inner = np.sum(sides[:, :-1, 1:] * solved, axis=1)
@@ -416,44 +400,35 @@ def _step(equations: list[np.ndarray], damping: np.ndarray) -> np.ndarray:
 
 def _minimise(
     candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float, steps: int, damping: np.ndarray
-) -> tuple[Candidates, np.ndarray]:
-    """At most `steps` Gauss-Newton steps for a given penalty, and the damping after them.
+) -> tuple[Candidates, Residuals, np.ndarray]:
+    """At most `steps` Gauss-Newton steps for a given penalty, the residuals and the damping after them.
 
     The damping follows the ratio of the gain to the one that the linear model promised (Nielsen, "Damping parameter in
     Marquardt's method", Technical University of Denmark, 1999); a step that does not lower the merit is repeated.
     """
     # A Python number would be a constant of the program.
     weight = jnp.asarray(penalty)
-    merit, *equations = (np.array(part) for part in _normal_equations(candidates, task, multipliers, weight))
-    (unknowns, durations), growth = map(np.array, candidates), np.full(len(merit), 2.0)
+    best = jax.tree.map(np.array, (candidates, _equations(candidates, task, multipliers, weight)))
+    (unknowns, durations), equations = best
+    growth = np.full(len(durations), 2.0)
     for _ in range(steps):
         step = _step(equations, damping)
-        promised = np.sum(step * (damping[:, None] * step - equations[0]), axis=1)
-        if np.all(promised < TINY_GAIN * merit):
+        promised = np.sum(step * (damping[:, None] * step - equations.gradient), axis=1)
+        if np.all(promised < TINY_GAIN * equations.merit):
             break
         longer, moved = np.exp(step[:, -1]), unknowns + step[:, :-1].reshape(unknowns.shape)
         moved[..., -1] /= longer[:, None]
         trial = Candidates(moved, durations * longer)
-        new = tuple(map(np.asarray, _normal_equations(trial, task, multipliers, weight)))
-        gain = np.where(np.isfinite(new[2]).all((1, 2)), (merit - new[0]) / promised, -1.0).clip(-1.0, 2.0)
+        new = jax.tree.map(np.asarray, (trial, _equations(trial, task, multipliers, weight)))
+        gain = (equations.merit - new[1].merit) / promised
+        gain = np.where(np.isfinite(new[1].band).all((1, 2)), gain, -1.0).clip(-1.0, 2.0)
         better = gain > 0.0
-        for old, part in zip((merit, *equations, unknowns, durations), (*new, *trial), strict=True):
+        for old, part in zip(jax.tree.leaves(best), jax.tree.leaves(new), strict=True):
             old[better] = part[better]
         damping = damping * np.where(better, np.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), growth)
         damping = np.clip(damping, LEAST_DAMPING, MOST_DAMPING)
         growth = np.where(better, 2.0, 2.0 * growth)
-    return Candidates(unknowns, durations), damping
-
-
-def violation(evaluation: Residuals) -> np.ndarray:
-    """The greatest violation of a constraint in every lane, in the units of the residuals."""
-    equalities, inequalities = np.asarray(evaluation.equalities), np.asarray(evaluation.inequalities)
-    return np.maximum(np.abs(equalities).max((1, 2)), -inequalities.min((1, 2)).clip(max=0.0))
-
-
-def objective(evaluation: Residuals) -> np.ndarray:
-    """The objective of every lane."""
-    return np.sum(np.asarray(evaluation.objective) ** 2, axis=(1, 2))
+    return best[0], equations.residuals, damping
 
 
 def optimise(candidates: Candidates, task: Task, firmness: float = 1.0) -> tuple[Candidates, np.ndarray, np.ndarray]:
@@ -464,26 +439,31 @@ def optimise(candidates: Candidates, task: Task, firmness: float = 1.0) -> tuple
     """
     in_haste = bool(task.haste > 0.0)
     (penalties, steps, settled), enough = (HASTY, np.all) if in_haste else (CALM, np.any)
+    lanes, rows, _ = candidates.unknowns.shape
+    intervals = rows - ORDER + 1
+    one = eqx.filter_eval_shape(interval_residuals, candidates.unknowns[0, :ORDER], task, 0, intervals, task.haste)
+    multipliers = (
+        np.zeros((lanes, intervals, *one.equalities.shape)),
+        np.zeros((lanes, intervals, *one.inequalities.shape)),
+    )
     # Where the weight makes the effort large, the penalties would be too weak beside it.
-    least = float(objective(residuals(candidates, task)).min())
+    first = _equations(candidates, task, multipliers, jnp.asarray(penalties[0])).residuals
+    least = float(np.sum(np.asarray(first.objective) ** 2, axis=(1, 2)).min())
     task = eqx.tree_at(lambda task: task.force, task, task.force * np.sqrt(max(1.0, least)))
-    evaluation = residuals(candidates, task)
-    multipliers = Multipliers(jnp.zeros_like(evaluation.equalities), jnp.zeros_like(evaluation.inequalities))
-    values = np.full(len(candidates.durations), np.inf)
-    damping = np.full(len(candidates.durations), FIRST_DAMPING)
-    last = firmness * penalties[0]
+    violation = values = np.full(lanes, np.inf)
+    damping, last = np.full(lanes, FIRST_DAMPING), firmness * penalties[0]
     for penalty in firmness * np.array(penalties):
-        multipliers, last = Multipliers(*(part * (last / penalty) for part in multipliers)), penalty
-        candidates, damping = _minimise(candidates, task, multipliers, penalty, steps, damping)
-        evaluation, before = residuals(candidates, task), values
-        values = candidates.durations if in_haste else objective(evaluation)
-        if enough((violation(evaluation) < FEASIBLE) & (np.abs(values - before) < settled * values)):
+        multipliers, last = (multipliers[0] * (last / penalty), multipliers[1] * (last / penalty)), penalty
+        candidates, residuals, damping = _minimise(candidates, task, multipliers, penalty, steps, damping)
+        equalities, inequalities, objective = map(np.asarray, residuals)
+        # The greatest violation of a constraint in every lane, in the units of the residuals.
+        violation = np.maximum(np.abs(equalities).max((1, 2)), -inequalities.min((1, 2)).clip(max=0.0))
+        before, efforts = values, np.sum(objective**2, axis=(1, 2))
+        values = np.asarray(candidates.durations) if in_haste else efforts
+        if enough((violation < FEASIBLE) & (np.abs(values - before) < settled * values)):
             break
-        multipliers = Multipliers(
-            multipliers.equalities + evaluation.equalities,
-            jnp.minimum(multipliers.inequalities + evaluation.inequalities, 0.0),
-        )
-    return candidates, violation(evaluation), np.asarray(values)
+        multipliers = multipliers[0] + equalities, np.minimum(multipliers[1] + inequalities, 0.0)
+    return candidates, violation, values
 
 
 # The input of a plan: a force and a torque over time, and feedback that holds the planned speed and steering angle.
@@ -548,13 +528,12 @@ def _needed(
     dynamics: Dynamics, pose: Pose, splines: Splines, t1: Numbers
 ) -> tuple[Float[Array, " fine"], Float[Array, " fine"], Float[Array, "fine components"]]:
     """Force, torque and pose of a drive from a pose, `FINE` times in every interval and at the end."""
-    intervals = len(splines[0]) - ORDER + 1
+    intervals = len(splines) - ORDER + 1
     duration = t1 / intervals
 
     def step(pose: Pose, k: Int[Array, ""]) -> tuple[Pose, tuple[Numbers, Numbers, Pose]]:
         first = jnp.minimum(k // FINE, intervals - 1)
-        steering, front_speed = (jax.lax.dynamic_slice_in_dim(spline, first, ORDER) for spline in splines)
-        window, part = (steering, front_speed), k / FINE - first
+        window, part = jax.lax.dynamic_slice_in_dim(splines, first, ORDER), k / FINE - first
         needed = actuation(dynamics, pose, motion_at(window, part, duration), False)
         end = drive_from(dynamics, pose, window, part, 1.0 / FINE, duration)
         return end, (needed.force, needed.torque, pose)
@@ -562,18 +541,16 @@ def _needed(
     return jax.lax.scan(step, pose, jnp.arange(intervals * FINE + 1))[1]
 
 
-def drive_along(
-    dynamics: Dynamics, pose: Pose, steering: Float[np.ndarray, " n"], front_speed: Float[np.ndarray, " n"], t1: float
-) -> Drive:
+def drive_along(dynamics: Dynamics, pose: Pose, coefficients: Float[Array | np.ndarray, "rows 2"], t1: float) -> Drive:
     """The input that gives a stroller, from a pose, the steering angle and the speed of two splines."""
-    duration, splines = jnp.asarray(t1, dtype=float), (jnp.asarray(steering), jnp.asarray(front_speed))
+    duration, splines = jnp.asarray(t1, dtype=float), jnp.asarray(coefficients)
     force, torque, poses = _needed(dynamics, pose, splines, duration)
     body = dynamics.body
     weight = scale(body.mass * dynamics.gravity, dynamics.up)
     force = subtract(force, dot(weight, padded(poses[:, dynamics.surface.axes :].T)))
     return Drive(
         duration,
-        *splines,
+        *splines.T,
         force=jnp.asarray(interpolate(np.asarray(force))),
         torque=jnp.asarray(interpolate(np.asarray(torque))),
         weight=weight,
