@@ -36,7 +36,7 @@ from measure import machine, table, write_csv
 from shortest_paths import dubins, reeds_shepp
 
 import stroller
-from stroller.planning.plan import CONFIRMED, TIGHT
+from stroller.planning.plan import TIGHT
 from stroller.planning.problem import Problem
 from stroller.planning.result import checked_drive
 from stroller.planning.search import paths_of, prices
@@ -139,7 +139,7 @@ def judged(problem: Problem, answer: Any, cpu: float, wall: float) -> Outcome:
         return Outcome(False, cpu, wall, np.nan)
     splines = interpolate(np.stack([answer.steering, answer.front_speed], axis=1))
     drive = drive_along(problem.scene.dynamics, problem.start_pose, splines, answer.t1)
-    plan = checked_drive(dataclasses.replace(problem, t1=answer.t1), drive, TIGHT, CONFIRMED)
+    plan = checked_drive(dataclasses.replace(problem, t1=answer.t1), drive, TIGHT)
     return Outcome(plan.reached, cpu, wall, plan.effort)
 
 

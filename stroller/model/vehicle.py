@@ -341,24 +341,27 @@ def as_place(value: Any) -> tuple[Converted, ...]:
     return numbers
 
 
-def suspected_degrees(module: Bounded) -> str | None:
-    """The suspicion that an angle of a module, of those that have usual values, is in degrees; `None` if none is. Raises
-    `ValueError` for an angle beyond a turn."""
-    for name, limit in USUAL.items():
-        magnitude = largest(getattr(module, name, None))
-        degrees = IN_DEGREES.format(f"{magnitude:g}")
-        if magnitude > 2.0 * math.pi:
-            raise ValueError(f"{name} = {shown(getattr(module, name))} must be within [-2 pi, 2 pi]{degrees}")
-        if magnitude > limit:
-            return f"{name} = {magnitude:g} rad is large{degrees}"
-    return None
+class Angled(Bounded):
+    """A module whose angles may have been given in degrees."""
+
+    def suspicion(self) -> str | None:
+        """The suspicion that an angle, of those that have usual values, is in degrees; `None` if none is. Raises `ValueError`
+        for an angle beyond a turn."""
+        for name, limit in USUAL.items():
+            magnitude = largest(getattr(self, name, None))
+            degrees = IN_DEGREES.format(f"{magnitude:g}")
+            if magnitude > 2.0 * math.pi:
+                raise ValueError(f"{name} = {shown(getattr(self, name))} must be within [-2 pi, 2 pi]{degrees}")
+            if magnitude > limit:
+                return f"{name} = {magnitude:g} rad is large{degrees}"
+        return None
 
 
 #: Speeds above this [m/s] suggest kilometres per hour.
 FASTEST = 60.0
 
 
-class Launch(Bounded):
+class Launch(Angled):
     """A launch: position of the rear axle, heading, speed and steering.
 
     **Arguments:**
@@ -400,4 +403,4 @@ class Launch(Bounded):
         fastest = largest(self.speed)
         if fastest > FASTEST:
             return f"speed = {fastest:g} m/s is fast: was it in km/h? {fastest:g} km/h are {fastest / 3.6:.4g} m/s"
-        return suspected_degrees(self)
+        return super().suspicion()

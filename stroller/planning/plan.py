@@ -40,9 +40,8 @@ from .transcription import (
 #: Candidates that are optimised together.
 LANES = 2
 
-#: Tolerance of the run that confirms a plan; times of a run that is compared with others, and of one that is confirmed.
+#: Tolerance of the run that confirms a plan.
 TIGHT = 1e-9
-COMPARED, CONFIRMED = 501, 2001
 
 #: A candidate with a greater violation of the constraints (see `transcription.py`) is not worth a run if there is a better one.
 HOPELESS = 0.05
@@ -142,7 +141,7 @@ def plan(
                 break
         best = min(attempts, key=lambda attempt: (attempt.excess, attempt.effort))
         if not best.reached:
-            best = checked_drive(problem, best.input, TIGHT, CONFIRMED)
+            best = checked_drive(problem, best.input, TIGHT)
             best = dataclasses.replace(best, hindrances=(*best.hindrances, *reasons[:1]))
     knots = np.nan_to_num(np.concatenate(tried)[:, : INTERVALS + 1, : scene.surface.axes])
     fine = np.linspace(0.0, INTERVALS, FINE * INTERVALS + 1)
@@ -189,9 +188,9 @@ def _attempts(
                     break
                 splines, t1 = candidates.unknowns[lane][:, -2:], float(candidates.durations[lane])
                 drive = drive_along(problem.scene.dynamics, problem.start_pose, splines, t1)
-                attempt = checked_drive(problem, drive, tolerance, COMPARED)
+                attempt = checked_drive(problem, drive, tolerance)
                 # A solution is driven again at a tight tolerance, and this run counts.
-                attempts.append(checked_drive(problem, drive, TIGHT, CONFIRMED) if attempt.reached else attempt)
+                attempts.append(checked_drive(problem, drive, TIGHT) if attempt.reached else attempt)
                 yield attempts[-1]
             overlap = -max(attempt.clearance for attempt in attempts)
             shares = [[-attempt.margins[name] / width for name, width in widths] for attempt in attempts]

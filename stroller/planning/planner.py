@@ -156,6 +156,7 @@ class Planner(eqx.Module):
         (end, _), (rows, poses) = jax.lax.scan(jax.checkpoint(decision), (pose, first), jnp.arange(DECISIONS))
         return Proposal(jnp.concatenate([first, rows]), poses, end)
 
+    @eqx.filter_jit
     def proposals(self, task: Task, t1: Numbers) -> tuple[Float[Array, " proposals"], Proposal]:
         """The merits of all proposals for a problem, and the proposals."""
 
@@ -181,11 +182,6 @@ def merit(task: Task, proposal: Proposal, t1: Numbers) -> Numbers:
     return MISSED * missed + BROKEN * broken + SPENT * jnp.sum(effort**2) / DECISIONS
 
 
-@eqx.filter_jit
-def _proposals(planner: Planner, task: Task, t1: Numbers) -> tuple[Float[Array, " proposals"], Proposal]:
-    return planner.proposals(task, t1)
-
-
 def proposed(planner: Planner, task: Task, t1: float) -> Float[np.ndarray, "rows unknowns"] | None:
     """The best proposal as unknowns of the optimiser (see `transcription.py`); `None` if no proposal is finite. Raises
     `ValueError` if the planner has learned on another kind of ground or with another wheelbase."""
@@ -197,7 +193,7 @@ def proposed(planner: Planner, task: Task, t1: float) -> Float[np.ndarray, "rows
         misfit = f"learned with a wheelbase of {planner.wheelbase:g} m, and that of this scene is {wheelbase:g} m"
     if misfit is not None:
         raise ValueError(f"planner: it has {misfit}; learn in this scene")
-    merits, proposals = jax.tree.map(np.asarray, _proposals(planner, task, jnp.asarray(t1)))
+    merits, proposals = jax.tree.map(np.asarray, planner.proposals(task, jnp.asarray(t1)))
     best = np.argmin(np.where(np.isfinite(merits), merits, np.inf))
     if not np.isfinite(merits[best]):
         return None

@@ -27,7 +27,7 @@ from nonholonomic.validation import (
 
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import Scene
-from ..model.vehicle import Launch, as_numbers, as_place, suspected_degrees
+from ..model.vehicle import Angled, Launch, as_numbers, as_place
 
 #: Numbers, and points (..., points, 2), in NumPy or in JAX.
 Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
@@ -280,7 +280,7 @@ UNLIMITED = 1e9
 MOST_STEERING = 1.2
 
 
-class Goal(Bounded):
+class Goal(Angled):
     """Where a plan ends, and how fast.
 
     **Arguments:**
@@ -309,9 +309,6 @@ class Goal(Bounded):
     speed: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     within: Float[Array, ""] = eqx.field(converter=as_number, default=0.05, metadata=Bound.POSITIVE)
 
-    def suspicion(self) -> str | None:
-        return suspected_degrees(self)
-
 
 def as_range(value: Any) -> Any:
     """A positive bound as the pair (-bound, bound); a pair, `None` and anything else stay as they are."""
@@ -322,7 +319,7 @@ def as_range(value: Any) -> Any:
     return (-bound, bound) if isinstance(bound, Array) and (is_traced(bound) or bound > 0.0) else value
 
 
-class Limits(Bounded):
+class Limits(Angled):
     """The ranges that a plan must not leave, each a pair (low, high) or one number b for (-b, b); `None` for no limit.
     A plan may exceed a limit by 0.001 of its range, so that a limit can be the very value at the start or at the goal, as
     in `speed=(0.0, 0.8)` for a plan that never reverses.
@@ -362,9 +359,6 @@ class Limits(Bounded):
                 bound = f"{largest(as_number(value)) or 1.0:g}"
                 words = f"one positive number, such as {bound} for (-{bound}, {bound}), or a pair (lowest, highest)"
                 raise ValueError(f"{name} = {shown(value)} must be {words}")
-
-    def suspicion(self) -> str | None:
-        return suspected_degrees(self)
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
@@ -418,7 +412,8 @@ def corners_of(dynamics: Dynamics, footprint: Footprint, pose: Float[Array, "com
 
 
 @eqx.filter_jit
-def _pose(scene: Scene, place: tuple[ArrayLike, ...], heading: Float[Array, ""]) -> Pose:
+def pose_of(scene: Scene, place: tuple[ArrayLike, ...], heading: Float[Array, ""]) -> Pose:
+    """A position and a heading [rad], in the ground's axes, as one array."""
     position, east, north = scene.surface.chart(place)
     direction = scene.dynamics.heading.at_angle(heading, east, north)
     return jnp.stack([*position[: scene.surface.axes], *direction[: scene.surface.axes]])
@@ -462,19 +457,16 @@ class Problem(eqx.Module):
     footprint: Footprint
     in_haste: bool = False
 
-    def pose(self, place: tuple[ArrayLike, ...], heading: ArrayLike) -> Pose:
-        """Position and heading, in the ground's axes, as one array."""
-        return _pose(self.scene, place, jnp.asarray(heading))
-
     @functools.cached_property
     def start_pose(self) -> Pose:
         """The pose of the launch."""
-        return self.pose(self.launch.place, self.launch.heading)
+        return pose_of(self.scene, self.launch.place, self.launch.heading)
 
     @functools.cached_property
     def goal_pose(self) -> Pose:
         """The pose of the goal; its heading is 0 if the goal has none."""
-        return self.pose(self.goal.place, 0.0 if self.goal.heading is None else self.goal.heading)
+        heading = jnp.zeros(()) if self.goal.heading is None else self.goal.heading
+        return pose_of(self.scene, self.goal.place, heading)
 
     @property
     def distance(self) -> float:
@@ -517,9 +509,9 @@ class Problem(eqx.Module):
     def gaps_at_ends(self) -> dict[str, Float[np.ndarray, " obstacles"]]:
         """The distance [m] of the footprint from every obstacle at the launch and at the goal, negative for an overlap; at the
         best of all headings if the goal has none."""
-        goal, whole_turn = self.goal, np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
+        goal, whole_turn = self.goal, jnp.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
         headings = whole_turn if goal.heading is None else [goal.heading]
-        poses = [self.start_pose, *(self.pose(goal.place, heading) for heading in headings)]
+        poses = [self.start_pose, *(pose_of(self.scene, goal.place, heading) for heading in headings)]
         corners = np.asarray(corners_of(self.scene.dynamics, self.footprint, jnp.stack(poses, axis=1)))
         launch, *goals = np.stack([obstacle.distance(corners) for obstacle in self.obstacles], axis=1)
         return {"launch": launch, "goal": max(goals, key=np.min)}

@@ -184,6 +184,9 @@ class Plan(eqx.Module):
 
 # The check of a drive: a run at a tight tolerance, the exact clearance of the whole footprint, and every limit.
 
+#: Times of the run, the same for all drives, so that they share their programs.
+TIMES = 2001
+
 #: How many times finer the closest approaches are examined.
 FINER = 10
 
@@ -192,10 +195,10 @@ FINER = 10
 ALLOWED = 1e-3
 
 
-def checked_drive(problem: Problem, drive: Drive, tolerance: float, times: int) -> Plan:
-    """The drive as a plan: its run, with a number of times, what this run achieves, and what stands in the way."""
+def checked_drive(problem: Problem, drive: Drive, tolerance: float) -> Plan:
+    """The drive as a plan: its run, what this run achieves, and what stands in the way."""
     t1, scene, goal, axes = float(drive.duration), problem.scene, problem.goal, problem.scene.surface.axes
-    run = simulate(scene, problem.launch, t1, drive, times=np.linspace(0.0, t1, times), tolerance=tolerance)
+    run = simulate(scene, problem.launch, t1, drive, times=np.linspace(0.0, t1, TIMES), tolerance=tolerance)
     along = seen_along(scene.dynamics, problem.footprint, drive, run.t, run.state)
     corners, force, torque = map(np.asarray, along)
     values = {"steering": run.steering, "speed": run.speed, "force": force, "torque": torque}

@@ -260,21 +260,22 @@ def interval_residuals(
 ) -> Residuals:
     """All residuals of the interval `index` of `intervals`."""
     poses, splines = window[:, :-2], window[:, -2:]
-    is_last = index == intervals - 1
+    is_last, parts = index == intervals - 1, np.arange(STEPS + 1) / STEPS
 
-    def step(pose, k):
-        part = k / STEPS
-        terms = point_residuals(task, pose, motion_at(splines, part, duration))
-        return drive_from(task.dynamics, pose, splines, part, 1.0 / STEPS, duration), terms
+    def step(pose, part):
+        return drive_from(task.dynamics, pose, splines, part, 1.0 / STEPS, duration), pose
 
-    end, (inequalities, effort) = jax.lax.scan(step, poses[0], jnp.arange(STEPS))
+    end, driven = jax.lax.scan(step, poses[0], jnp.asarray(parts[:-1]))
+    motions = motion_at(splines, jnp.asarray(parts)[:, None], duration)
+    points = jnp.concatenate([driven, end[None]])
+    inequalities, effort = jax.vmap(point_residuals, (None, 0, 0))(task, points, motions)
     # No interval follows the last one.
-    first, last = motion_at(splines, 0.0, duration), motion_at(splines, 1.0, duration)
-    at_end, _ = point_residuals(task, end, last)
+    inequalities = jnp.where(is_last | (parts < 1.0)[:, None], inequalities, 1.0)
+    first, last = (jax.tree.map(lambda part, k=k: part[k], motions) for k in (0, STEPS))
     between = motion_at(splines, jnp.asarray(BETWEEN)[:, None], duration)
     values = jnp.stack([between.steering, between.front_speed * jnp.cos(between.steering)], axis=-1)
     within = jnp.concatenate([values - task.low[:2], task.high[:2] - values]) / jnp.stack([1.0, task.speed])
-    inequalities = jnp.concatenate([inequalities.ravel(), jnp.where(is_last, at_end, 1.0), within.ravel()])
+    inequalities = jnp.concatenate([inequalities.ravel(), within.ravel()])
     axes, length = task.dynamics.surface.axes, task.length
     units = jnp.concatenate([jnp.full(axes, length), jnp.ones(len(end) - axes)])
     at_start, at_goal = jnp.where(index == 0, 1.0, 0.0), jnp.where(is_last, 1.0, 0.0)
@@ -286,7 +287,7 @@ def interval_residuals(
     equalities = [(poses[1] - end) / units, at_start * (poses[0] - pose) / units, at_start * jnp.stack(starts)]
     equalities += [at_goal * away, at_goal * jnp.stack(ends)]
     smooth = SMOOTHNESS * (splines[2] - 2.0 * splines[1] + splines[0]) / jnp.stack([1.0, task.speed])
-    objective = jnp.concatenate([effort.ravel() / jnp.sqrt(STEPS * intervals), smooth])
+    objective = jnp.concatenate([effort[:-1].ravel() / jnp.sqrt(STEPS * intervals), smooth])
     objective = jnp.where(task.haste > 0.0, EASE, 1.0) * objective
     return Residuals(jnp.concatenate(equalities), inequalities, objective)
 
@@ -324,35 +325,37 @@ CALM, HASTY = ((100.0, 300.0, *(1e3,) * 6), 8, 0.02), ((10.0, *(30.0,) * 15), 60
 
 
 class Equations(NamedTuple):
-    """The equations of a Gauss-Newton step in every lane: the merit (lanes,), its gradient, the lower band of the matrix
-    without its last row, and this row; and the residuals of all intervals."""
+    """The equations of a Gauss-Newton step in every lane: the merit, its gradient, the lower band of the matrix without its
+    last row, and this row; and the residuals of all intervals."""
 
-    merit: Float[Array | np.ndarray, " lanes"]
-    gradient: Float[Array | np.ndarray, "lanes unknowns"]
-    band: Float[Array | np.ndarray, "lanes band others"]
-    edge: Float[Array | np.ndarray, "lanes unknowns"]
+    merit: Float[Array | np.ndarray, "*lanes"]
+    gradient: Float[Array | np.ndarray, "*lanes unknowns"]
+    band: Float[Array | np.ndarray, "*lanes band others"]
+    edge: Float[Array | np.ndarray, "*lanes unknowns"]
     residuals: Residuals
 
 
 #: Multipliers of the equalities and of the inequalities, in units of the penalty, shaped as the residuals.
 Multipliers: TypeAlias = tuple[
-    Float[Array | np.ndarray, "lanes intervals _"], Float[Array | np.ndarray, "lanes intervals _"]
+    Float[Array | np.ndarray, "*lanes intervals equalities"], Float[Array | np.ndarray, "*lanes intervals inequalities"]
 ]
 
 
 @eqx.filter_jit
-def _equations(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: Numbers) -> Equations:
-    """The equations of a step from some candidates.
+def _of_lane(
+    unknowns: Float[Array, "rows unknowns"], t1: Numbers, task: Task, multipliers: Multipliers, penalty: Numbers
+) -> Equations:
+    """The equations of a step from one candidate.
 
     The last of the unknowns is the logarithm of the factor of the duration; the speeds change inversely to it, so that the
     path stays.
     """
-    _, rows, width = candidates.unknowns.shape
+    rows, width = unknowns.shape
     intervals, root = rows - ORDER + 1, jnp.sqrt(penalty)
     # The poses of the third and the fourth row of a window have no influence.
     used = np.array([k for k in range(ORDER * width) if k < 2 * width or k % width >= width - 2])
 
-    def of_interval(window, t1, multipliers, index):
+    def of_interval(window, multipliers, index):
         def terms(numbers):
             duration = t1 * jnp.exp(jnp.where(task.haste > 0.0, numbers[-1], 0.0))
             changed = window.ravel().at[used].set(numbers[:-1]).reshape(window.shape)
@@ -368,18 +371,25 @@ def _equations(candidates: Candidates, task: Task, multipliers: Multipliers, pen
         slope, (value, residuals) = jax.jacfwd(terms, has_aux=True)(jnp.append(window.ravel()[used], 0.0))
         return value @ value, slope.T @ value, slope.T @ slope, residuals
 
-    def of_lane(unknowns, t1, multipliers):
-        of_all = jax.vmap(of_interval, (0, None, 0, 0))
-        merit, gradient, matrix, residuals = of_all(windows(unknowns), t1, multipliers, jnp.arange(intervals))
-        number = np.arange(intervals)[:, None] * width + used
-        number = np.append(number, np.full((intervals, 1), rows * width), axis=1)
-        total, edge = (jnp.zeros(rows * width + 1).at[number].add(part) for part in (gradient, matrix[:, -1]))
-        row, column = np.tril_indices(len(used))
-        band = jnp.zeros((ORDER * width, rows * width))
-        band = band.at[(used[row] - used[column])[None], number[:, column]].add(matrix[:, row, column])
-        return Equations(merit.sum(), total, band, edge, residuals)
+    merit, gradient, matrix, residuals = jax.vmap(of_interval)(windows(unknowns), multipliers, jnp.arange(intervals))
+    number = np.arange(intervals)[:, None] * width + used
+    number = np.append(number, np.full((intervals, 1), rows * width), axis=1)
+    total, edge = (jnp.zeros(rows * width + 1).at[number].add(part) for part in (gradient, matrix[:, -1]))
+    row, column = np.tril_indices(len(used))
+    band = jnp.zeros((ORDER * width, rows * width))
+    band = band.at[(used[row] - used[column])[None], number[:, column]].add(matrix[:, row, column])
+    return Equations(merit.sum(), total, band, edge, residuals)
 
-    return jax.vmap(of_lane)(*candidates, multipliers)
+
+def equations_of(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float) -> Equations:
+    """The equations of all lanes, which share the program of one."""
+    # A Python number would be a constant of the program.
+    weight = jnp.asarray(penalty)
+    lanes = [
+        _of_lane(jnp.asarray(unknowns), jnp.asarray(t1), task, (equal, unequal), weight)
+        for unknowns, t1, equal, unequal in zip(*candidates, *multipliers, strict=True)
+    ]
+    return jax.tree.map(lambda *parts: np.stack(parts), *lanes)
 
 
 def _step(equations: Equations, damping: Float[np.ndarray, " lanes"]) -> Float[np.ndarray, "lanes unknowns"]:
@@ -406,9 +416,7 @@ def _minimise(
     The damping follows the ratio of the gain to the one that the linear model promised (Nielsen, "Damping parameter in
     Marquardt's method", Technical University of Denmark, 1999); a step that does not lower the merit is repeated.
     """
-    # A Python number would be a constant of the program.
-    weight = jnp.asarray(penalty)
-    best = jax.tree.map(np.array, (candidates, _equations(candidates, task, multipliers, weight)))
+    best = jax.tree.map(np.array, (candidates, equations_of(candidates, task, multipliers, penalty)))
     (unknowns, durations), equations = best
     growth = np.full(len(durations), 2.0)
     for _ in range(steps):
@@ -419,7 +427,7 @@ def _minimise(
         longer, moved = np.exp(step[:, -1]), unknowns + step[:, :-1].reshape(unknowns.shape)
         moved[..., -1] /= longer[:, None]
         trial = Candidates(moved, durations * longer)
-        new = jax.tree.map(np.asarray, (trial, _equations(trial, task, multipliers, weight)))
+        new = trial, equations_of(trial, task, multipliers, penalty)
         gain = (equations.merit - new[1].merit) / promised
         gain = np.where(np.isfinite(new[1].band).all((1, 2)), gain, -1.0).clip(-1.0, 2.0)
         better = gain > 0.0
@@ -441,14 +449,15 @@ def optimise(candidates: Candidates, task: Task, firmness: float = 1.0) -> tuple
     (penalties, steps, settled), enough = (HASTY, np.all) if in_haste else (CALM, np.any)
     lanes, rows, _ = candidates.unknowns.shape
     intervals = rows - ORDER + 1
-    one = eqx.filter_eval_shape(interval_residuals, candidates.unknowns[0, :ORDER], task, 0, intervals, task.haste)
+    window, index = jnp.asarray(candidates.unknowns[0, :ORDER]), jnp.asarray(0)
+    one = eqx.filter_eval_shape(interval_residuals, window, task, index, intervals, task.haste)
     multipliers = (
         np.zeros((lanes, intervals, *one.equalities.shape)),
         np.zeros((lanes, intervals, *one.inequalities.shape)),
     )
     # Where the weight makes the effort large, the penalties would be too weak beside it.
-    first = _equations(candidates, task, multipliers, jnp.asarray(penalties[0])).residuals
-    least = float(np.sum(np.asarray(first.objective) ** 2, axis=(1, 2)).min())
+    first = equations_of(candidates, task, multipliers, penalties[0]).residuals
+    least = float(np.sum(first.objective**2, axis=(1, 2)).min())
     task = eqx.tree_at(lambda task: task.force, task, task.force * np.sqrt(max(1.0, least)))
     violation = values = np.full(lanes, np.inf)
     damping, last = np.full(lanes, FIRST_DAMPING), firmness * penalties[0]
@@ -526,28 +535,26 @@ class Drive(eqx.Module):
 @eqx.filter_jit
 def _needed(
     dynamics: Dynamics, pose: Pose, splines: Splines, t1: Numbers
-) -> tuple[Float[Array, " fine"], Float[Array, " fine"], Float[Array, "fine components"]]:
-    """Force, torque and pose of a drive from a pose, `FINE` times in every interval and at the end."""
+) -> tuple[Float[Array, " fine"], Float[Array, " fine"], Vector]:
+    """Force without the weight's part and torque of a drive from a pose, `FINE` times in every interval and at the end; and
+    the weight."""
     intervals = len(splines) - ORDER + 1
-    duration = t1 / intervals
+    duration, weight = t1 / intervals, scale(dynamics.body.mass * dynamics.gravity, dynamics.up)
 
-    def step(pose: Pose, k: Int[Array, ""]) -> tuple[Pose, tuple[Numbers, Numbers, Pose]]:
+    def step(pose: Pose, k: Int[Array, ""]) -> tuple[Pose, tuple[Numbers, Numbers]]:
         first = jnp.minimum(k // FINE, intervals - 1)
         window, part = jax.lax.dynamic_slice_in_dim(splines, first, ORDER), k / FINE - first
         needed = actuation(dynamics, pose, motion_at(window, part, duration), False)
-        end = drive_from(dynamics, pose, window, part, 1.0 / FINE, duration)
-        return end, (needed.force, needed.torque, pose)
+        force = subtract(needed.force, dot(weight, padded(pose[dynamics.surface.axes :])))
+        return drive_from(dynamics, pose, window, part, 1.0 / FINE, duration), (force, needed.torque)
 
-    return jax.lax.scan(step, pose, jnp.arange(intervals * FINE + 1))[1]
+    return *jax.lax.scan(step, pose, jnp.arange(intervals * FINE + 1))[1], weight
 
 
 def drive_along(dynamics: Dynamics, pose: Pose, coefficients: Float[Array | np.ndarray, "rows 2"], t1: float) -> Drive:
     """The input that gives a stroller, from a pose, the steering angle and the speed of two splines."""
-    duration, splines = jnp.asarray(t1, dtype=float), jnp.asarray(coefficients)
-    force, torque, poses = _needed(dynamics, pose, splines, duration)
-    body = dynamics.body
-    weight = scale(body.mass * dynamics.gravity, dynamics.up)
-    force = subtract(force, dot(weight, padded(poses[:, dynamics.surface.axes :].T)))
+    duration, splines, body = jnp.asarray(t1, dtype=float), jnp.asarray(coefficients), dynamics.body
+    force, torque, weight = _needed(dynamics, pose, splines, duration)
     return Drive(
         duration,
         *splines.T,

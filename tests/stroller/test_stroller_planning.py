@@ -20,7 +20,7 @@ from stroller import __main__ as job
 from stroller.planning import planner as planner_module
 from stroller.planning.planner import proposed
 from stroller.planning.problem import Obstacles, checked_problem, disc_distance, separation
-from stroller.planning.result import planned_stage, seen_along
+from stroller.planning.result import TIMES, planned_stage, seen_along
 from stroller.planning.search import Costs, Ground, Search, Steps, paths_of, prices
 from stroller.planning.transcription import Rates, Task, actuation, drive_along, evaluate, interpolate
 
@@ -85,10 +85,15 @@ def edge_of_footprint(run):
     return np.asarray(run.place)[:, None] + np.stack(turned, axis=-1)
 
 
+def times_of(plan):
+    """As many times as a plan's own run has, for the programs of that run."""
+    return np.linspace(0.0, plan.t1, TIMES)
+
+
 def assert_solves(plan, launch, goal, obstacles):
     """Drive a plan again, and look at its end, its limits and every point of its edge."""
     assert plan.reached, str(plan)
-    run = stroller.simulate(SCENE, launch, plan.t1, plan.input, times=np.linspace(0.0, plan.t1, 2001), tolerance=1e-9)
+    run = stroller.simulate(SCENE, launch, plan.t1, plan.input, times=times_of(plan), tolerance=1e-9)
     assert np.hypot(*(run.place[-1] - np.array(goal.place))) < 0.05
     assert abs(np.angle(np.exp(1j * (run.heading[-1] - goal.heading)))) < 0.05
     assert abs(run.speed[-1]) < 0.05
@@ -205,7 +210,7 @@ def test_candidates_are_smooth_curves(parked):
 def test_a_table_drives_a_plan_as_a_single_ride_does(parked):
     """The splines of a plan belong to a ride, whatever the number of cells: their coefficients are not one per cell."""
     launch, _, plan = parked
-    run = stroller.simulate(SCENE, launch, plan.t1, plan.input, times=[plan.t1])
+    run = stroller.simulate(SCENE, launch, plan.t1, plan.input, times=times_of(plan))
     axes = {"body.mass": [5.0, 5.1, 5.0]}
     table = stroller.sweep(SCENE, launch, plan.t1, axes=axes, input=plan.input, progress=False)
     ends = np.stack([table.x, table.y], axis=-1)
@@ -249,8 +254,8 @@ def test_a_plan_can_go_without_reverse(sign, goal):
 def test_the_wheel_can_be_limited_to_one_side():
     launch, plan = freely(stroller.Goal((2.0, 2.0)), 10.0, stroller.Limits(steering=(0.0, 1.0)))
     assert plan.reached, str(plan)
-    times = np.linspace(0.0, plan.t1, 61)
-    run = stroller.simulate(SCENE, launch, plan.t1, stroller.track(SCENE, plan), times=times, tolerance=1e-9)
+    tracker = stroller.track(SCENE, plan)
+    run = stroller.simulate(SCENE, launch, plan.t1, tracker, times=times_of(plan), tolerance=1e-9)
     assert np.hypot(*(run.place[-1] - 2.0)) < 0.05
 
 
@@ -278,8 +283,8 @@ def test_a_solution_that_a_finer_run_refutes_is_not_the_end(monkeypatch):
     module, confirmed = importlib.import_module("stroller.planning.plan"), []
     run_and_judge = module.checked_drive
 
-    def checked_drive(problem, drive, tolerance, times):
-        plan = run_and_judge(problem, drive, tolerance, times)
+    def checked_drive(problem, drive, tolerance):
+        plan = run_and_judge(problem, drive, tolerance)
         if tolerance == module.TIGHT:
             confirmed.append(drive)
         return dataclasses.replace(plan, hindrances=("refuted",) if len(confirmed) == 1 else plan.hindrances)
@@ -438,7 +443,7 @@ def test_tracking_brings_a_disturbed_ride_to_the_goal():
     body = stroller.Stroller(mass=5.25, wheelbase=0.25, inertia=0.105, steering_inertia=0.005)
     wrong = stroller.Scene(body, friction=stroller.Damping(2.1, 0.525, 0.105, 0.0525))
     elsewhere = stroller.Launch((0.07, 0.93), 0.1, 0.0)
-    tracker, times = stroller.track(SCENE, plan), np.linspace(0.0, plan.t1, 61)
+    tracker, times = stroller.track(SCENE, plan), times_of(plan)
     runs = [
         stroller.simulate(wrong, elsewhere, plan.t1, drive, times=times, tolerance=1e-9)
         for drive in (plan.input, tracker)
@@ -554,7 +559,7 @@ def test_a_bad_problem_is_refused_before_anything_compiles(changed, message, cap
     arguments = {"launch": START, "goal": GOAL, "t1": 12.0, "obstacles": GAP} | OPTIONS | changed
     with jax.log_compiles(), pytest.raises(ValueError, match=message):
         stroller.plan(SCENE, **arguments)
-    assert not [text for text in caplog.messages if "Finished XLA compilation" in text and "_equations" in text]
+    assert not [text for text in caplog.messages if "Finished XLA compilation" in text and "_of_lane" in text]
 
 
 class Sleigh(nonholonomic.AbstractSystem):
