@@ -381,6 +381,17 @@ def _of_lane(
     return Equations(merit.sum(), total, band, edge, residuals)
 
 
+# Compiled, it traces the residuals once.
+@eqx.filter_jit
+def _no_multipliers(candidates: Candidates, task: Task) -> Multipliers:
+    """Multipliers of zero for all constraints."""
+    lanes, rows, width = candidates.unknowns.shape
+    window, intervals = jnp.zeros((ORDER, width)), rows - ORDER + 1
+    one = eqx.filter_eval_shape(interval_residuals, window, task, jnp.asarray(0), intervals, task.haste)
+    equalities, inequalities, _ = (jnp.zeros((lanes, intervals, *part.shape)) for part in one)
+    return equalities, inequalities
+
+
 def equations_of(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float) -> Equations:
     """The equations of all lanes, which share the program of one."""
     # A Python number would be a constant of the program.
@@ -447,14 +458,7 @@ def optimise(candidates: Candidates, task: Task, firmness: float = 1.0) -> tuple
     """
     in_haste = bool(task.haste > 0.0)
     (penalties, steps, settled), enough = (HASTY, np.all) if in_haste else (CALM, np.any)
-    lanes, rows, _ = candidates.unknowns.shape
-    intervals = rows - ORDER + 1
-    window, index = jnp.asarray(candidates.unknowns[0, :ORDER]), jnp.asarray(0)
-    one = eqx.filter_eval_shape(interval_residuals, window, task, index, intervals, task.haste)
-    multipliers = (
-        np.zeros((lanes, intervals, *one.equalities.shape)),
-        np.zeros((lanes, intervals, *one.inequalities.shape)),
-    )
+    lanes, multipliers = len(candidates.durations), jax.tree.map(np.asarray, _no_multipliers(candidates, task))
     # Where the weight makes the effort large, the penalties would be too weak beside it.
     first = equations_of(candidates, task, multipliers, penalties[0]).residuals
     least = float(np.sum(first.objective**2, axis=(1, 2)).min())
