@@ -203,7 +203,7 @@ class Task(eqx.Module):
             clearance=jnp.asarray(clearance),
             length=body.wheelbase,
             speed=jnp.asarray(speed),
-            force=jnp.asarray(float(body.mass) * speed / min(1.0, 0.1 * t1)),
+            force=jnp.asarray(float(body.mass) * speed / min(1.0, 0.1 * t1), dtype=float),
             haste=jnp.asarray(1.0 / t1 if problem.in_haste else 0.0),
             with_grip=problem.limits.grip is not None,
         )
@@ -394,10 +394,10 @@ def _no_multipliers(candidates: Candidates, task: Task) -> Multipliers:
 
 def equations_of(candidates: Candidates, task: Task, multipliers: Multipliers, penalty: float) -> Equations:
     """The equations of all lanes, which share the program of one."""
-    # A Python number would be a constant of the program.
-    weight = jnp.asarray(penalty)
+    # A Python number would be a constant of the program, and an array of a weak type would compile a second one.
+    weight = jnp.asarray(penalty, dtype=float)
     lanes = [
-        _of_lane(jnp.asarray(unknowns), jnp.asarray(t1), task, (equal, unequal), weight)
+        _of_lane(jnp.asarray(unknowns), jnp.asarray(t1, dtype=float), task, (equal, unequal), weight)
         for unknowns, t1, equal, unequal in zip(*candidates, *multipliers, strict=True)
     ]
     return jax.tree.map(lambda *parts: np.stack(parts), *lanes)
