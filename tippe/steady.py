@@ -61,17 +61,13 @@ from .model.scene import Launch, Scene
 MANY, A_MOTION = "jax.vmap maps over several", ", as tumbling(scene, theta) returns it"
 
 
-def _require_top(body: object) -> None:
-    """Raise `ValueError` unless the body is a `Top`."""
+def _require_top(body: object, caller: str | None = None) -> None:
+    """Raise `ValueError` unless the body is a `Top`; with known scalars, if a `caller` is named."""
     if not isinstance(body, Top):
         raise ValueError(f"body = {shown(body)} must be a Top: the formulas are those of a sphere")
-
-
-def _require_one_top(body: Top, caller: str) -> None:
-    """Raise `ValueError` unless the body is a `Top` with known scalars. **Arguments:** `caller`: the function."""
-    _require_top(body)
-    require_outside(body, caller, "steady.proportions")
-    require_scalars(numbers("body", body), MANY)
+    if caller is not None:
+        require_outside(body, caller, "steady.proportions")
+        require_scalars(numbers("body", body), MANY)
 
 
 def _require_one_scene(scene: Scene, **values: object) -> None:
@@ -291,7 +287,7 @@ def group(body: Top) -> str:
     >>> steady.group(top)
     'II'
     """
-    _require_one_top(body, "steady.group")
+    _require_top(body, "steady.group")
     alpha, gamma = (float(number) for number in proportions(body))
     return "I" if gamma <= 1.0 - alpha else "III" if gamma >= 1.0 + alpha else "II"
 
@@ -307,7 +303,7 @@ def folds(body: Top) -> bool:
     >>> steady.folds(top), steady.folds(tippe.Top(0.02, 0.02, 0.006, I1=2.5e-6, I3=3.2e-6))
     (False, True)
     """
-    _require_one_top(body, "steady.folds")
+    _require_top(body, "steady.folds")
     alpha, gamma = proportions(body)
     delta = (1.0 + 6.0 * alpha + alpha**2 - (1.0 - alpha) * jnp.sqrt(1.0 + 14.0 * alpha + alpha**2)) / 8.0
     return bool(gamma < 1.0 - delta)

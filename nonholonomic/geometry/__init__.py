@@ -9,10 +9,10 @@ from .frames import AbstractFrame as AbstractFrame
 from .frames import CarriedFrame as CarriedFrame
 from .frames import FrameMotion as FrameMotion
 from .frames import PlaneFrame as PlaneFrame
+from .frames import Pose as Pose
 from .frames import Tangent as Tangent
 from .frames import frame_of as frame_of
 from .frames import place_named as place_named
-from .frames import room_bounds as room_bounds
 from .level_sets import Graph as Graph
 from .level_sets import Implicit as Implicit
 from .level_sets import Paraboloid as Paraboloid

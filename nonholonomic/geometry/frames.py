@@ -6,23 +6,21 @@ V and S is the shape operator of the parallel surface, positive where it is conc
 turn about n, so the components of a fixed vector change as `vector.rate_in_frame` states.
 
 The frame of a convex body of any shape moves with its contact point: R = 0, and V is that point's velocity along the surface
-(`AbstractFrame.convex_motion`).
+(`AbstractFrame.frame_motion`).
 
 Plane, cylinder and sphere have their own frames, with fewer numbers than the general one, `CarriedFrame`. A sphere
 or cylinder is the same from both sides, except for the sign of its radius, which is positive inside.
 """
 
 import abc
-from collections.abc import Iterator
 from typing import ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from ..compilation.xla_cpu import least, stored
-from ..validation import Bound, as_number
-from .surface import AbstractSurface, Cylinder, Place, Plane, Sphere, Torus
+from .surface import AbstractSurface, Cylinder, Place, Plane, Sphere
 from .vector import (
     Component,
     Vector,
@@ -76,12 +74,23 @@ class FrameMotion(NamedTuple):
     - `frame_rate`: (o1, o2) = S V [rad/s]; `vertical`: the upward vertical in the frame.
     - `place_rate`: rate of the place.
     - `room`: positive where the ball fits, 1 where the surface is flat; `None` if it fits everywhere.
+    - `contact_velocity`: velocity of the contact point of a convex body along the surface [m/s].
     """
 
     frame_rate: Tangent
     vertical: Vector
     place_rate: Place
-    room: Component = None
+    room: Component
+    contact_velocity: Tangent
+
+
+class Pose(NamedTuple):
+    """Where a frame is, for pictures: the vectors t1, t2 and n in the fixed frame, the position of the centre [m] in
+    the fixed frame, and the angle eta [rad] from the lowest point."""
+
+    axes: tuple[Vector, Vector, Vector]
+    position: Vector
+    angle: Float[Array, "..."]
 
 
 class AbstractFrame(eqx.Module):
@@ -94,32 +103,24 @@ class AbstractFrame(eqx.Module):
     #: Distance R [m] from the foot to the point with which the frame moves.
     distance: eqx.AbstractVar[Float[Array, "..."]]
 
-    @abc.abstractmethod
-    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
-        """Place and cyclic coordinates at the angle `eta` [rad] from the lowest point, in the x-z plane."""
+    #: Which components of the place are lengths, the others have the magnitude 1: a constant or property of every kind.
+    lengths: ClassVar[tuple[bool, ...]]
 
     @abc.abstractmethod
-    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
-        """Place and cyclic coordinates of a ball that touches the surface at a point [m], given in the surface's axes."""
+    def start(self, foot: Vector, along_eta: bool = False) -> tuple[Place, Place]:
+        """Place and cyclic coordinates of a ball that touches the surface at a point [m], given in the surface's axes.
 
-    @abc.abstractmethod
-    def place_scales(self, size: Component) -> Place:
-        """Magnitudes of the place's components. **Arguments:** `size`: size of the body [m]."""
-
-    @abc.abstractmethod
-    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        """Motion of the frame while the centre moves with the velocity (V1, V2) [m/s]."""
-
-    @abc.abstractmethod
-    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
-        """Motion of the frame of a convex body, and the velocity of its contact point along the surface [m/s].
-
-        **Arguments:** `velocity`, `radii`: as for `contact_velocity`; the frame has R = 0.
+        **Arguments:** `along_eta`: whether t1 points along growing eta inside a sphere, as it always does in a cylinder;
+        the projection of the x axis reverses its direction at eta = pi/2.
         """
 
     @abc.abstractmethod
-    def vertical(self, place: Place) -> Vector:
-        """Components of the upward vertical in the frame."""
+    def frame_motion(self, place: Place, velocity: Tangent, radii: TangentOperator | None = None) -> FrameMotion:
+        """Motion of the frame while the centre of a ball moves with the velocity (V1, V2) [m/s], or the contact point of
+        a convex body.
+
+        **Arguments:** for a convex body, `velocity` and `radii` as for `contact_velocity`; the frame then has R = 0.
+        """
 
     @abc.abstractmethod
     def height(self, place: Place) -> Component:
@@ -131,16 +132,16 @@ class AbstractFrame(eqx.Module):
         """Rate of change of `cyclic`."""
 
     @abc.abstractmethod
-    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        """Angle eta [rad] from the lowest point."""
+    def pose(self, place: Place, cyclic: Place) -> Pose:
+        """Where the frame is."""
 
-    @abc.abstractmethod
-    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
-        """The vectors t1, t2 and n in the fixed frame."""
+    def vertical(self, place: Place) -> Vector:
+        """Components of the upward vertical in the frame."""
+        return self.frame_motion(place, (0.0, 0.0)).vertical
 
-    @abc.abstractmethod
-    def position(self, place: Place, cyclic: Place) -> Vector:
-        """Position of the centre [m] in the fixed frame."""
+    def place_scales(self, size: Component) -> Place:
+        """Magnitudes of the place's components. **Arguments:** `size`: size of the body [m]."""
+        return tuple(size if is_length else 1.0 for is_length in self.lengths)
 
 
 class PlaneFrame(AbstractFrame):
@@ -153,24 +154,16 @@ class PlaneFrame(AbstractFrame):
     distance: Float[Array, "..."]
     slope: tuple[Float[Array, "..."], Float[Array, "..."]] | None = None
 
-    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
-        zero = jnp.zeros_like(as_number(eta))
-        return self.at_foot((zero, zero))
+    @property
+    def lengths(self) -> tuple[bool, ...]:
+        return () if self.slope is None else (True,)
 
-    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
+    def start(self, foot: Vector, along_eta: bool = False) -> tuple[Place, Place]:
         return ((), foot[:2]) if self.slope is None else (foot[:1], foot[1:2])
 
-    def place_scales(self, size: Component) -> Place:
-        return () if self.slope is None else (size,)
-
-    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        return FrameMotion((None, None), self.vertical(place), () if self.slope is None else velocity[:1])
-
-    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
-        return self.frame_motion(place, velocity), velocity
-
-    def vertical(self, place: Place) -> Vector:
-        return (None, None, 1.0) if self.slope is None else (self.slope[0], None, self.slope[1])
+    def frame_motion(self, place: Place, velocity: Tangent, radii: TangentOperator | None = None) -> FrameMotion:
+        up = (None, None, 1.0) if self.slope is None else (self.slope[0], None, self.slope[1])
+        return FrameMotion((None, None), up, velocity[: len(self.lengths)], None, velocity)
 
     def height(self, place: Place) -> Component:
         return self.distance if self.slope is None else self.slope[0] * place[0] + self.slope[1] * self.distance
@@ -178,20 +171,14 @@ class PlaneFrame(AbstractFrame):
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         return velocity[2 - len(cyclic) :]
 
-    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        return jnp.zeros_like(cyclic[0])
-
-    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
-        zero, one = jnp.zeros_like(cyclic[0]), jnp.ones_like(cyclic[0])
-        if self.slope is None:
-            return (one, zero, zero), (zero, one, zero), (zero, zero, one)
-        sine, cosine = one * self.slope[0], one * self.slope[1]
-        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
-
-    def position(self, place: Place, cyclic: Place) -> Vector:
+    def pose(self, place: Place, cyclic: Place) -> Pose:
         x, y = (*place, *cyclic)
-        t1, t2, normal = self.axes(place, cyclic)
-        return sum_vectors(scale(x, t1), scale(y, t2), scale(self.distance, normal))
+        zero, one = jnp.zeros_like(y), jnp.ones_like(y)
+        sine, cosine = (zero, one) if self.slope is None else (one * self.slope[0], one * self.slope[1])
+        axes = (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
+        t1, t2, normal = axes
+        position = sum_vectors(scale(x, t1), scale(y, t2), scale(self.distance, normal))
+        return Pose(axes, position, zero)
 
 
 class AbstractRoundFrame(AbstractFrame):
@@ -208,21 +195,17 @@ class AbstractRoundFrame(AbstractFrame):
     distance: Float[Array, "..."]
     side: float = eqx.field(static=True)
 
-    def place_scales(self, size: Component) -> Place:
-        return (1.0, 1.0, 1.0) if self.is_curved_along_t2 else (1.0, 1.0)
-
-    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        up = self.vertical(place)
-        frame_rate = (velocity[0] / self.radius, velocity[1] / self.radius if self.is_curved_along_t2 else None)
+    def frame_motion(self, place: Place, velocity: Tangent, radii: TangentOperator | None = None) -> FrameMotion:
+        room = None
+        if radii is not None:
+            curvature = 1.0 / self.radius
+            shape = (curvature, None, curvature if self.is_curved_along_t2 else None)
+            velocity, _, room = contact_velocity(shape, radii, velocity)
         # The place has the components of the vertical that do not vanish.
+        up = tuple(place) if self.is_curved_along_t2 else (place[0], None, place[1])
+        frame_rate = (velocity[0] / self.radius, velocity[1] / self.radius if self.is_curved_along_t2 else None)
         place_rate = tuple(rate for rate in rate_in_frame(up, frame_rate) if rate is not None)
-        return FrameMotion(frame_rate, up, place_rate)
-
-    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
-        curvature = 1.0 / self.radius
-        shape = (curvature, None, curvature if self.is_curved_along_t2 else None)
-        contact_rate, _, room = contact_velocity(shape, radii, velocity)
-        return self.frame_motion(place, contact_rate)._replace(room=room), contact_rate
+        return FrameMotion(frame_rate, up, place_rate, room, velocity)
 
     def height(self, place: Place) -> Component:
         # The lowest point is at the distance of the radius below the axis or the centre, on either side.
@@ -232,38 +215,25 @@ class AbstractRoundFrame(AbstractFrame):
 class CylinderFrame(AbstractRoundFrame):
     """A cylinder whose axis is y: t2 along y, n = (-sin c, 0, cos c), and the place is (sin c, cos c).
 
-    Inside, c is eta and t1 points along growing eta; outside, c = eta - pi.
+    Inside, c is eta and t1 points along growing eta; outside, c = eta - pi. The cyclic coordinates are eta and y.
     """
 
     is_curved_along_t2: ClassVar[bool] = False
+    lengths: ClassVar[tuple[bool, ...]] = (False, False)
 
-    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
-        eta = as_number(eta)
-        return scale(self.side, (jnp.sin(eta), jnp.cos(eta))), (eta, jnp.zeros_like(eta))
-
-    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
+    def start(self, foot: Vector, along_eta: bool = False) -> tuple[Place, Place]:
         x, y, z = foot
-        place, (eta, _) = self.at_angle(jnp.arctan2(x, -z))
-        return place, (eta, y)
-
-    def vertical(self, place: Place) -> Vector:
-        sine, cosine = place
-        return (sine, None, cosine)
+        eta = jnp.arctan2(x, -z)
+        return scale(self.side, (jnp.sin(eta), jnp.cos(eta))), (eta, y)
 
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         return (frame_rate[0], velocity[1])
 
-    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        return cyclic[0]
-
-    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
-        sine, cosine = place
+    def pose(self, place: Place, cyclic: Place) -> Pose:
+        (sine, cosine), (eta, y) = place, cyclic
         zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
-        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
-
-    def position(self, place: Place, cyclic: Place) -> Vector:
-        sine, cosine = place
-        return (self.radius * sine, cyclic[1], -self.radius * cosine)
+        axes = (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
+        return Pose(axes, (self.radius * sine, y, -self.radius * cosine), eta)
 
 
 class SphereFrame(AbstractRoundFrame):
@@ -273,39 +243,29 @@ class SphereFrame(AbstractRoundFrame):
     """
 
     is_curved_along_t2: ClassVar[bool] = True
+    lengths: ClassVar[tuple[bool, ...]] = (False, False, False)
 
-    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
-        eta = as_number(eta)
-        zero, sine, cosine = jnp.zeros_like(eta), self.side * jnp.sin(eta), self.side * jnp.cos(eta)
-        return (sine, zero, cosine), (cosine, zero, -sine)
-
-    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
+    def start(self, foot: Vector, along_eta: bool = False) -> tuple[Place, Place]:
         n = scale(-self.side / jnp.sqrt(dot(foot, foot)), foot)
-        t1, t2 = tangents(n)
+        t1, t2 = start_tangents(n, along_eta)
         return (t1[2], t2[2], n[2]), (t1[0], t2[0], n[0])
-
-    def vertical(self, place: Place) -> Vector:
-        return tuple(place)
 
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         return rate_in_frame(cyclic, frame_rate)
 
-    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        return jnp.arctan2(planar_length(place[0], place[1]), self.side * place[2])
-
-    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
+    def pose(self, place: Place, cyclic: Place) -> Pose:
         y = cross(place, cyclic)
         t1, t2, n = zip(cyclic, y, place, strict=True)
-        return t1, t2, n
-
-    def position(self, place: Place, cyclic: Place) -> Vector:
-        return scale(-self.radius, self.axes(place, cyclic)[2])
+        angle = jnp.arctan2(planar_length(place[0], place[1]), self.side * place[2])
+        return Pose((t1, t2, n), scale(-self.radius, n), angle)
 
 
-def along(n: Vector, direction: Vector) -> tuple[Vector, Vector]:
-    """Unit vectors across n: t1 along the projection of a direction onto the tangent plane, and t2 = n x t1."""
-    t1 = unit(difference(direction, scale(dot(n, direction), n)))
-    return t1, cross(n, t1)
+def start_tangents(normal: Vector, along_eta: bool) -> tuple[Vector, Vector]:
+    """The vectors t1 and t2 of a start: t1 along growing eta, or the projection of the x axis."""
+    if not along_eta:
+        return tangents(normal)
+    t1 = (normal[2], jnp.zeros_like(normal[1]), -normal[0])
+    return t1, cross(normal, t1)
 
 
 # The moving frame of a ball on any smooth surface, without coordinate singularities, and the choice of frame for a
@@ -326,30 +286,24 @@ def place_named(surface: AbstractSurface, place: Place) -> Place:
 
 
 def frame_of(
-    surface: AbstractSurface, side: float, distance: Float[Array, "..."], pull: Float[Array, "..."]
+    surface: AbstractSurface,
+    side: float,
+    distance: Float[Array, "..."],
+    pull: Float[Array, "..."],
+    carried: bool = False,
 ) -> AbstractFrame:
     """The frame of a ball on a surface: the surface's own if it has one, else a `CarriedFrame`.
 
-    **Arguments:** as for `CarriedFrame`.
+    **Arguments:** as for `CarriedFrame`; `carried`: whether to use a `CarriedFrame` for every surface.
     """
-    if isinstance(surface, Plane):
-        slope = None if surface.tilt is None else (jnp.sin(surface.tilt), jnp.cos(surface.tilt))
-        return PlaneFrame(distance, slope)
-    if isinstance(surface, Cylinder | Sphere):
+    up = surface.up
+    if isinstance(surface, Plane) and not carried:
+        return PlaneFrame(distance, None if surface.tilt is None else (up[0], up[2]))
+    if isinstance(surface, Cylinder | Sphere) and not carried:
         kind = CylinderFrame if isinstance(surface, Cylinder) else SphereFrame
         return kind(-side * surface.radius - distance, distance, -side)
-    return CarriedFrame.of(surface, distance, pull, side)
-
-
-def room_bounds(surface: AbstractSurface, side: float, distance: Float[Array, "..."]) -> Iterator[Bound]:
-    """The ranges of a surface's parameters for which a ball fits at some point of the surface.
-
-    **Arguments:** as for `CarriedFrame`.
-    """
-    if side < 0.0 and isinstance(surface, Cylinder | Sphere):
-        yield Bound(surface.radius, "surface radius", above=distance, why="the body must fit inside")
-    if side < 0.0 and isinstance(surface, Torus):
-        yield Bound(surface.tube, "surface tube", above=distance, why="the body must fit inside")
+    # The vertical is computed once: a tilted plane stores its tilt as an angle, and no step should compute the sine.
+    return CarriedFrame(surface=surface, distance=distance, pull=pull, up=up, side=side)
 
 
 class CarriedFrame(AbstractFrame):
@@ -362,73 +316,44 @@ class CarriedFrame(AbstractFrame):
     - `up`: the upward vertical in the surface's axes.
     """
 
+    lengths: ClassVar[tuple[bool, ...]] = (True, True, True, False, False, False)
+
     surface: AbstractSurface
     distance: Float[Array, "..."]
     pull: Float[Array, "..."]
     up: Vector
-    side: float = eqx.field(static=True, default=1.0)
+    side: float = eqx.field(static=True)
 
-    @classmethod
-    def of(
-        cls, surface: AbstractSurface, distance: Float[Array, "..."], pull: Float[Array, "..."], side: float = 1.0
-    ) -> "CarriedFrame":
-        """The frame of a ball on a surface. **Arguments:** the fields except `up`."""
-        # Computed once: a tilted plane stores its tilt as an angle, and no step should compute the sine.
-        return cls(surface=surface, distance=distance, pull=pull, up=surface.up, side=side)
-
-    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
-        eta = as_number(eta)
-        zero = jnp.zeros_like(eta)
-        names = [name for name, _ in self.surface.coordinates]
-        place = tuple(eta if name == "eta" else zero for name in names)
-        foot = self.surface.chart(place_named(self.surface, place))[0]
-        return self._start(foot, along_eta=isinstance(self.surface, Cylinder | Sphere))
-
-    def at_foot(self, foot: Vector) -> tuple[Place, Place]:
-        return self._start(foot, along_eta=isinstance(self.surface, Cylinder))
-
-    def _start(self, foot: Vector, along_eta: bool) -> tuple[Place, Place]:
-        """The frame at a foot. `along_eta`: whether t1 points along growing eta inside, as in `CylinderFrame`; the
-        projection of the x axis reverses its direction at eta = pi/2."""
+    def start(self, foot: Vector, along_eta: bool = False) -> tuple[Place, Place]:
         foot = tuple(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
-        normal = self.normal(foot)
-        t1 = (normal[2], jnp.zeros_like(normal[1]), -normal[0]) if along_eta else tangents(normal)[0]
-        return (*foot, *t1), ()
+        follows_eta = isinstance(self.surface, Cylinder) or (along_eta and isinstance(self.surface, Sphere))
+        return (*foot, *start_tangents(self.normal(foot), follows_eta)[0]), ()
 
     def normal(self, foot: Vector) -> Vector:
         """The normal n at a foot, in the surface's axes."""
         normal = scale(self.side, self.surface.normal(foot))
         return tuple(jnp.broadcast_to(0.0 if x is None else x, jnp.shape(foot[0])) for x in normal)
 
-    def place_scales(self, size: Component) -> Place:
-        return (size,) * 3 + (1.0,) * 3
-
-    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        # The distance R is the radius of the ball that touches.
-        return self.convex_motion(place, velocity, (self.distance, None, self.distance))[0]
-
-    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
+    def frame_motion(self, place: Place, velocity: Tangent, radii: TangentOperator | None = None) -> FrameMotion:
         foot, zero = place[:3], jnp.zeros_like(place[0])
-        # Stored, because otherwise each of the values below, and each of their derivatives, would compute these again.
-        n = stored(*self.normal(foot))
-        # If the first tangent has drifted, only its direction along the surface counts.
-        t1 = stored(*along(n, place[3:])[0])
-        t2 = cross(n, t1)
+        t1, t2, n = self.own_axes(place)
         bending = scale(-self.side, self.surface.bending(foot, t1, t2))
         shape = stored(*(zero if S is None else S for S in bending))
+        # The distance R is the radius of the ball that touches.
+        radii = (self.distance, None, self.distance) if radii is None else radii
         foot_velocity, frame_rate, room = contact_velocity(shape, radii, velocity)
         o1, o2, *up = stored(*frame_rate, *(dot(axis, self.up) for axis in (t1, t2, n)))
         pull_back = -self.pull * self.side * self.surface.offset(foot)
         carried = sum_vectors(scale(foot_velocity[0], t1), scale(foot_velocity[1], t2), scale(pull_back, n))
-        return FrameMotion((o1, o2), tuple(up), (*carried, *scale(o1, n)), room), foot_velocity
+        return FrameMotion((o1, o2), tuple(up), (*carried, *scale(o1, n)), room, foot_velocity)
 
     def own_axes(self, place: Place) -> tuple[Vector, Vector, Vector]:
         """The vectors t1, t2 and n in the surface's axes."""
-        n = self.normal(place[:3])
-        return (*along(n, place[3:]), n)
-
-    def vertical(self, place: Place) -> Vector:
-        return tuple(dot(axis, self.up) for axis in self.own_axes(place))
+        # Stored, because otherwise each of the values that need them, and each of their derivatives, would compute them again.
+        n = stored(*self.normal(place[:3]))
+        # If the first tangent has drifted, only its direction along the surface counts.
+        t1 = stored(*unit(difference(place[3:], scale(dot(n, place[3:]), n))))
+        return t1, cross(n, t1), n
 
     def height(self, place: Place) -> Component:
         return self.surface.elevation(place[:3]) + self.distance * dot(self.normal(place[:3]), self.up)
@@ -436,20 +361,17 @@ class CarriedFrame(AbstractFrame):
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
         return ()
 
-    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        """The angle eta in the surface's convention, or the slope of the ground if no coordinate of the surface is an
-        angle."""
+    def pose(self, place: Place, cyclic: Place) -> Pose:
+        """Where the frame is; the angle is eta in the surface's convention, or the slope of the ground if no coordinate of
+        the surface is an angle."""
         foot, names = place[:3], [name for name, _ in self.surface.coordinates]
-        if "eta" not in names:
-            t1_up, t2_up, n_up = self.vertical(place)
-            return jnp.arctan2(planar_length(t1_up, t2_up), n_up)
-        eta = self.surface.place_at(foot)[names.index("eta")]
-        return eta + 0.5 * jnp.pi if names[0] == "mu" else eta
-
-    def axes(self, place: Place, cyclic: Place) -> tuple[Vector, Vector, Vector]:
-        t1, t2, n = map(self.surface.in_fixed_frame, self.own_axes(place))
-        return t1, t2, n
-
-    def position(self, place: Place, cyclic: Place) -> Vector:
-        centre = sum_vectors(place[:3], scale(self.distance, self.normal(place[:3])))
-        return self.surface.in_fixed_frame(centre)
+        axes = self.own_axes(place)
+        if "eta" in names:
+            eta = self.surface.place_at(foot)[names.index("eta")]
+            angle = eta + 0.5 * jnp.pi if names[0] == "mu" else eta
+        else:
+            t1_up, t2_up, n_up = (dot(axis, self.up) for axis in axes)
+            angle = jnp.arctan2(planar_length(t1_up, t2_up), n_up)
+        t1, t2, n = map(self.surface.in_fixed_frame, axes)
+        centre = sum_vectors(foot, scale(self.distance, axes[2]))
+        return Pose((t1, t2, n), self.surface.in_fixed_frame(centre), angle)

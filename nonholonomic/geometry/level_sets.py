@@ -85,12 +85,6 @@ def _takes_lanes(function: Any, count: int) -> bool:
         return False
 
 
-def partials(function: Callable[..., Component], at: Vector) -> Vector:
-    """Partial derivatives of a function of several numbers, each a number or an array over lanes."""
-    alone = [lambda x, k=k: function(*at[:k], x, *at[k + 1 :]) for k in range(len(at))]
-    return tuple(jax.jvp(along, (x,), (jnp.ones_like(x),))[1] for along, x in zip(alone, at, strict=True))
-
-
 def second_derivative(function: Callable[..., Component], at: Vector, a: Vector, b: Vector) -> Float[Array, "..."]:
     """Second derivative of a function of several numbers along two vectors, each component a number or an array over lanes."""
     size, numbers = len(at), tuple(jnp.broadcast_arrays(*at, *a, *b))
@@ -188,30 +182,22 @@ class AbstractLevel(AbstractGradientSurface):
     starts: ClassVar[Float[np.ndarray, "sectors starts 3"]]
 
     @abc.abstractmethod
-    def level(self, position: Vector) -> Component:
+    def level(self, x: Component, y: Component, z: Component) -> Component:
         """The function at a position [m]."""
-
-    @abc.abstractmethod
-    def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
-        """Second derivative of the function at a position [m], along two vectors."""
 
     def offset(self, position: Vector) -> Component:
         gradient = self.gradient(position)
-        return self.level(position) / jnp.sqrt(dot(gradient, gradient))
+        return self.level(*position) / jnp.sqrt(dot(gradient, gradient))
 
-    def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
-        numbers = jnp.broadcast_arrays(*position, *velocity)
-        return jax.jvp(self.gradient, (tuple(numbers[:3]),), (tuple(numbers[3:]),))[1]
+    def gradient(self, position: Vector) -> Vector:
+        alone = [lambda x, k=k: self.level(*position[:k], x, *position[k + 1 :]) for k in range(3)]
+        return tuple(jax.jvp(along, (x,), (jnp.ones_like(x),))[1] for along, x in zip(alone, position, strict=True))
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> Vector:
         # As for any gradient; these derivatives cost less than its rate.
         gradient = self.gradient(position)
-        second = (self.second_derivative(position, *pair) for pair in ((a, a), (a, b), (b, b)))
+        second = (second_derivative(self.level, position, *pair) for pair in ((a, a), (a, b), (b, b)))
         return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), tuple(second))
-
-    def gaussian_curvature(self, position: Vector) -> Component:
-        aa, ab, bb = self.bending(position, *tangents(self.normal(position)))
-        return aa * bb - ab * ab
 
     def onto(self, position: Vector) -> Vector:
         for _ in range(2):
@@ -246,7 +232,7 @@ class AbstractLevel(AbstractGradientSurface):
         surface, place, size = _held(self), jax.lax.stop_gradient(centre), jax.lax.stop_gradient(radius)
 
         step, start = functools.partial(surface._step_on_ball, place, size), surface.normal(place)
-        normal = descended(step, unit, lambda normal: surface.level(_lowered(place, size, normal)), start, 1.0, 0.5)
+        normal = descended(step, unit, lambda normal: surface.level(*_lowered(place, size, normal)), start, 1.0, 0.5)
         s1, s2, t1, t2 = self._step_on_ball(centre, radius, normal)
         normal = unit(sum_vectors(normal, scale(s1, t1), scale(s2, t2)))
         minimum = _lowered(centre, radius, normal)
@@ -366,23 +352,20 @@ class Paraboloid(AbstractOpen, AbstractGradientSurface):
         def fallen(s: Component, r: Component, rise: Component, bend: Component) -> Component:
             return s - ((bend * s * s + rise) * s - r) / (3.0 * bend * s * s + rise)
 
-        constants = jax.lax.stop_gradient((r, rise, bend))
-        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: fallen(s, *constants), _above_the_root(*constants))
-        s = fallen(s, r, rise, bend)
+        numbers = (r, rise, bend)
+        r, rise, bend = constants = jax.lax.stop_gradient(numbers)
+        # An upper bound of the root. A cube root is expensive. By the inequality of means, (2 c + cube / c^2) / 3 is not
+        # below the cube root for any c; this c is close to the root.
+        cube = r / bend
+        fourth_root = jnp.sqrt(jnp.sqrt(cube))
+        c = fourth_root * jnp.sqrt(jnp.sqrt(fourth_root))
+        bound = jnp.sqrt(jnp.maximum(-rise / bend, 0.0)) + (2.0 * c + cube / (c * c)) / 3.0
+        bound = jnp.where(rise > 0.0, jnp.minimum(bound, r / jnp.where(rise > 0.0, rise, 1.0)), bound)
+        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: fallen(s, *constants), bound)
+        s = fallen(s, *numbers)
         # On the axis, above the centre of curvature, all directions are equally near.
-        part, x = s / r, x + jnp.where(square == 0.0, TINY, 0.0)
+        part, x = s / numbers[0], x + jnp.where(square == 0.0, TINY, 0.0)
         return (part * x, part * y, s * s / (2.0 * self.p))
-
-
-def _above_the_root(r: Component, rise: Component, bend: Component) -> Component:
-    """An upper bound of the greatest root s of bend s^3 + rise s = r, for r and bend above 0."""
-    cube = r / bend
-    fourth_root = jnp.sqrt(jnp.sqrt(cube))
-    # A cube root is expensive. By the inequality of means, (2 c + cube / c^2) / 3 is not below the cube root for any c;
-    # this c is close to the root.
-    c = fourth_root * jnp.sqrt(jnp.sqrt(fourth_root))
-    bound = jnp.sqrt(jnp.maximum(-rise / bend, 0.0)) + (2.0 * c + cube / (c * c)) / 3.0
-    return jnp.where(rise > 0.0, jnp.minimum(bound, r / jnp.where(rise > 0.0, rise, 1.0)), bound)
 
 
 def _disc(sectors: int, starts: int) -> Float[np.ndarray, "sectors starts 3"]:
@@ -424,19 +407,12 @@ class Graph(AbstractOpen, AbstractLevel):
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         return self.height(x, y)
 
-    def level(self, position: Vector) -> Component:
-        return position[2] - self.height(position[0], position[1])
+    def level(self, x: Component, y: Component, z: Component) -> Component:
+        return z - self.height(x, y)
 
     def onto(self, position: Vector) -> Vector:
         x, y, z = jnp.broadcast_arrays(*position)
         return (x, y, self.height(x, y) + 0.0 * z)
-
-    def gradient(self, position: Vector) -> Vector:
-        slope = partials(self.height, position[:2])
-        return (-slope[0], -slope[1], jnp.ones_like(slope[0]))
-
-    def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
-        return -second_derivative(self.height, position[:2], a[:2], b[:2])
 
 
 # The zero set of any smooth function of three coordinates.
@@ -484,14 +460,8 @@ class Implicit(AbstractLevel):
         converter=lambda function: as_function(function, "function", ("x", "y", "z"))
     )
 
-    def gradient(self, position: Vector) -> Vector:
-        return partials(self.function, position)
-
-    def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
-        return second_derivative(self.function, position, a, b)
-
-    def level(self, position: Vector) -> Component:
-        return self.function(*position)
+    def level(self, x: Component, y: Component, z: Component) -> Component:
+        return self.function(x, y, z)
 
     def place_at(self, position: Vector) -> Place:
         return tuple(position)

@@ -36,6 +36,7 @@ from .vector import (
     scale,
     subtract,
     sum_vectors,
+    tangents,
     unit,
 )
 
@@ -102,6 +103,9 @@ class AbstractSurface(Bounded):
     #: Whether the surface may rise and fall often along the path of a flight, so that flights look at it more often.
     is_wavy: ClassVar[bool] = True
 
+    #: Whether the Gaussian curvature vanishes identically.
+    is_developable: ClassVar[bool] = False
+
     #: The words for the side on which a body can be, and the sign of n that points to that side.
     sides: ClassVar[Mapping[str, float]] = CLOSED
 
@@ -110,7 +114,7 @@ class AbstractSurface(Bounded):
 
     @property
     def up(self) -> Vector:
-        """Components of the upward vertical in the surface's axes."""
+        """Components of the upward vertical in the surface's axes, which are those of the fixed frame turned about y."""
         return (None, None, 1.0)
 
     @abc.abstractmethod
@@ -129,11 +133,14 @@ class AbstractSurface(Bounded):
 
     def elevation(self, position: Vector) -> Component:
         """Height [m] of a position: above the lowest point, or above the origin, the default, of a surface that has none."""
-        return position[2]
+        return dot(position, self.up)
 
-    @abc.abstractmethod
     def gaussian_curvature(self, position: Vector) -> Component:
         """Gaussian curvature K [1/m^2] at a position [m] on the surface."""
+        if self.is_developable:
+            return None
+        aa, ab, bb = self.bending(position, *tangents(self.normal(position)))
+        return aa * bb - ab * ab
 
     @abc.abstractmethod
     def nearest(self, position: Vector) -> Vector:
@@ -220,12 +227,14 @@ class AbstractSurface(Bounded):
 
     def in_fixed_frame(self, vector: Vector) -> Vector:
         """Components of a vector in the fixed frame (x, y, z), z up."""
-        x, y, z = vector
-        return (x, y, jnp.zeros_like(x) if z is None else z)
+        (x, y, z), (sine, _, cosine) = vector, self.up
+        z = jnp.zeros_like(x) if z is None else z
+        return (x, y, z) if sine is None else (x * cosine - z * sine, y, x * sine + z * cosine)
 
     def in_own_axes(self, vector: Vector) -> Vector:
         """Components in the surface's axes of a vector in the fixed frame."""
-        return vector
+        (x, y, z), (sine, _, cosine) = vector, self.up
+        return vector if sine is None else (x * cosine + z * sine, y, z * cosine - x * sine)
 
 
 class AbstractGradientSurface(AbstractSurface):
@@ -235,9 +244,10 @@ class AbstractGradientSurface(AbstractSurface):
     def gradient(self, position: Vector) -> Vector:
         """A vector along the normal at a position [m]."""
 
-    @abc.abstractmethod
     def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
         """Rate [1/s] of the gradient at a position [m] that moves with a velocity [m/s]."""
+        numbers = jnp.broadcast_arrays(*position, *velocity)
+        return jax.jvp(self.gradient, (tuple(numbers[:3]),), (tuple(numbers[3:]),))[1]
 
     def normal(self, position: Vector) -> Vector:
         return unit(self.gradient(position))
@@ -288,6 +298,7 @@ class Plane(AbstractSurface):
 
     units: ClassVar[dict[str, str]] = {"tilt": "rad"}
     is_wavy: ClassVar[bool] = False
+    is_developable: ClassVar[bool] = True
 
     axes: ClassVar[int] = 2
     # "outside" is accepted for the only side of a plane, so that grounds can be compared.
@@ -310,12 +321,6 @@ class Plane(AbstractSurface):
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
         return (None, None, None)
 
-    def elevation(self, position: Vector) -> Component:
-        return dot(position, self.up)
-
-    def gaussian_curvature(self, position: Vector) -> Component:
-        return None
-
     def nearest(self, position: Vector) -> Vector:
         return (position[0], position[1], None)
 
@@ -325,19 +330,6 @@ class Plane(AbstractSurface):
     def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
         one, zero = jnp.ones_like(place[0]), jnp.zeros_like(place[0])
         return (place[0], place[1], None), (one, zero, None), (zero, one, None)
-
-    def in_fixed_frame(self, vector: Vector) -> Vector:
-        x, y, z = super().in_fixed_frame(vector)
-        if self.tilt is None:
-            return (x, y, z)
-        sine, cosine = jnp.sin(self.tilt), jnp.cos(self.tilt)
-        return (x * cosine - z * sine, y, x * sine + z * cosine)
-
-    def in_own_axes(self, vector: Vector) -> Vector:
-        if self.tilt is None:
-            return vector
-        (x, y, z), sine, cosine = vector, jnp.sin(self.tilt), jnp.cos(self.tilt)
-        return (x * cosine + z * sine, y, z * cosine - x * sine)
 
 
 # The cylinder with a horizontal axis.
@@ -365,6 +357,7 @@ class Cylinder(AbstractGradientSurface):
 
     units: ClassVar[dict[str, str]] = {"radius": "m"}
     is_wavy: ClassVar[bool] = False
+    is_developable: ClassVar[bool] = True
 
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("y", "m"), ("eta", "rad"))
 
@@ -373,21 +366,16 @@ class Cylinder(AbstractGradientSurface):
     def gradient(self, position: Vector) -> Vector:
         return (position[0], None, position[2])
 
-    def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
-        return (velocity[0], None, velocity[2])
-
     def elevation(self, position: Vector) -> Component:
         return position[2] + self.radius
 
-    def gaussian_curvature(self, position: Vector) -> Component:
-        return None
-
     def nearest(self, position: Vector) -> Vector:
-        part = self.radius / _across(position)
-        return (multiply(part, position[0]), position[1], multiply(part, position[2]))
+        x, y, z = position
+        part = self.radius / jnp.sqrt(x * x + z * z)
+        return (part * x, y, part * z)
 
     def distance(self, position: Vector) -> Component:
-        return _across(position) - self.radius
+        return jnp.sqrt(position[0] * position[0] + position[2] * position[2]) - self.radius
 
     def place_at(self, position: Vector) -> Place:
         return (position[1], jnp.arctan2(position[0], -position[2]))
@@ -400,11 +388,6 @@ class Cylinder(AbstractGradientSurface):
             (zero, jnp.ones_like(eta), zero),
             (cosine, zero, sine),
         )
-
-
-def _across(position: Vector) -> Component:
-    """Distance [m] of a position from the axis."""
-    return jnp.sqrt(position[0] * position[0] + position[2] * position[2])
 
 
 # Sphere and spheroid: the quadrics of revolution about the vertical.
@@ -434,9 +417,6 @@ class AbstractQuadric(AbstractGradientSurface):
         equatorial, polar = self.semi_axes
         across, along = 1.0 / (equatorial * equatorial), 1.0 / (polar * polar)
         return (multiply(across, position[0]), multiply(across, position[1]), multiply(along, position[2]))
-
-    def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
-        return self.gradient(velocity)
 
     def elevation(self, position: Vector) -> Component:
         return position[2] + self.semi_axes[1]

@@ -62,11 +62,7 @@ class Geometry(NamedTuple):
     cosine: Float[Array, "..."]
     normal_force: Component
     front_load: Component
-
-    @property
-    def rear_load(self) -> Component:
-        """Load [N] on the rear axle."""
-        return subtract(self.normal_force, self.front_load)
+    rear_load: Component
 
 
 class Forces(NamedTuple):
@@ -164,6 +160,7 @@ class Dynamics(eqx.Module):
         front_speed = multiply(wheel, lead)
         yaw_rate = front_speed * sine / body.wheelbase
         steering_rate = subtract(fork_rate, multiply(self.absolute, yaw_rate))
+        front_load = multiply(normal_force, None if body.centre is None else body.centre / body.wheelbase)
         motion = Motion(r, unit, phi, front_speed * cosine, front_speed, yaw_rate, steering_rate)
         return Geometry(
             motion=motion,
@@ -178,7 +175,8 @@ class Dynamics(eqx.Module):
             sine=sine,
             cosine=cosine,
             normal_force=normal_force,
-            front_load=multiply(normal_force, None if body.centre is None else body.centre / body.wheelbase),
+            front_load=front_load,
+            rear_load=subtract(normal_force, front_load),
         )
 
     def normal_force(self, normal: Vector, normal_rate: Vector, velocity: Vector) -> Component:

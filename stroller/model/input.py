@@ -284,13 +284,12 @@ def _by_elements(of_ride: Any, numbers: list[Array], shapes: list[tuple[int, ...
     def of_elements(elements: list[list[Array]], moving: list[Array]) -> Any:
         return of_ride([jnp.stack(part).reshape(shape) for part, shape in zip(elements, shapes, strict=True)], moving)
 
-    elements = [[number] if number.ndim == 0 else _rows(number) for number in numbers]
+    elements = []
+    for number in numbers:
+        flat = number.reshape(-1, *number.shape[-1:])
+        # This operation's derivative joins all elements at once.
+        split = [number] if number.ndim == 0 else [row[0] for row in jax.lax.split(flat, (1,) * len(flat))]
+        elements.append(split)
     scalars = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), (elements, moving))
     results = by_components(of_elements, *scalars)(elements, moving)
     return jax.tree.map(lambda part: jnp.broadcast_to(part, moving[0].shape), results)
-
-
-def _rows(number: Float[Array, "... rides"]) -> list[Float[Array, " rides"]]:
-    """The elements of an array in all rides, by an operation whose derivative joins all elements at once."""
-    flat = number.reshape(-1, number.shape[-1])
-    return [row[0] for row in jax.lax.split(flat, (1,) * len(flat))]

@@ -33,7 +33,7 @@ def states(scene):
     e = np.array([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
     w = 40.0 * rng.normal(size=(3, COUNT))
     L = TOP.I1 * w + (TOP.I3 - TOP.I1) * np.sum(w * e, axis=0) * e
-    place = np.reshape(scene.frame.at_angle(rng.uniform(-1.0, 1.0, COUNT))[0], (-1, COUNT))
+    place = np.reshape(scene.start(tippe.Launch(0.0, 0.0, eta=rng.uniform(-1.0, 1.0, COUNT)))[0], (-1, COUNT))
     return jnp.concatenate([0.3 * rng.normal(size=(2, COUNT)), e, L, place])
 
 

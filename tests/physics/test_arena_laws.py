@@ -78,7 +78,7 @@ class Start(NamedTuple):
             return np.tile(random.normal(size=(*shape, COUNT // 2)), 2)
 
         place_near = tuple(jnp.asarray(part + spread * draw()) for part in place_guess)
-        place_and_path = scene.frame.at_foot(tuple(filled(surface.nearest(surface.in_own_axes(place_near)))))
+        place_and_path = scene.frame.start(tuple(filled(surface.nearest(surface.in_own_axes(place_near)))))
         V, e, L = (draw(3) for _ in range(3))
         e, L = e / np.linalg.norm(e, axis=0), 100.0 * body.I3 * L
         u = 0.3 * V - body.offset * jnp.cross(L, e, axis=0) / body.I1
@@ -93,7 +93,7 @@ def filled(vector):
 
 def axes_at(scene, place_and_path):
     """The frame's vectors in the fixed frame, (3, 3, lanes)."""
-    return jnp.stack([filled(axis) for axis in scene.frame.axes(*place_and_path)])
+    return jnp.stack([filled(axis) for axis in scene.frame.pose(*place_and_path).axes])
 
 
 def in_space(scene, place_and_path, vector):
@@ -119,7 +119,7 @@ def quantities_of(scene, state, cyclic):
     turning = jnp.cross(filled(L), filled(e), axis=0) / scene.body.I1
     axis, normal = in_space(scene, place_and_path, e), axes_at(scene, place_and_path)[2]
     velocity = in_space(scene, place_and_path, (*u, -offset * turning[2]))
-    centre = filled(scene.frame.position(*place_and_path))
+    centre = filled(scene.frame.pose(*place_and_path).position)
     numbers = (in_space(scene, place_and_path, L), normal, scene.energy(state), scene.jellett(state))
     return Seen(centre - offset * axis, velocity, axis, *numbers)
 

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.geometry import CarriedFrame
+from nonholonomic.geometry import frame_of
 from nonholonomic.validation import as_number
 from tippe.friction import AbstractFriction, ContactLoad
 from tippe.model.dynamics import Dynamics
@@ -81,7 +81,7 @@ def test_an_independent_program_sees_the_same_forces(case):
     scene, launch = scene_of(case, tuple(top.near))
     rates, force = top.motion(y)
     state = scene.state(launch)
-    motion, axes = scene.dynamics.motion(state), np.array(scene.frame.axes(*scene.start(launch)), dtype=float)
+    motion, axes = scene.dynamics.motion(state), np.array(scene.frame.pose(*scene.start(launch)).axes, dtype=float)
     assert_close(state[2:5] @ axes, y[6:9], atol=1e-13)
     assert_close(motion.normal_force, force, rtol=1e-11)
     e, L = state[2:5] @ axes, state[5:8] @ axes
@@ -111,9 +111,9 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
     scene = tippe.Scene(rutstam_top(), surface, tippe.Coulomb(0.3, 0.1), side=side)
     launch = tippe.Launch(0.8, 100.0, azimuth=0.5, velocity=(0.1, -0.05), angular_velocity=(3.0, -2.0, 1.0), **place)
     state, (own_place, own_path) = scene.state(launch), scene.start(launch)
-    general_frame = CarriedFrame.of(surface, scene.body.radius, jnp.asarray(20.0), surface.sign(side, "inside"))
-    axes = scene.frame.axes(own_place, own_path)
-    centre, normal = scene.frame.position(own_place, own_path), axes[2]
+    general_frame = frame_of(surface, surface.sign(side, "inside"), scene.body.radius, jnp.asarray(20.0), carried=True)
+    axes, centre, _ = scene.frame.pose(own_place, own_path)
+    normal = axes[2]
     foot = tuple(c - scene.body.radius * n for c, n in zip(centre, normal, strict=True))
     first = (*surface.in_own_axes(foot), *surface.in_own_axes(axes[0]))
     motions = []
@@ -132,8 +132,8 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
             :, -1
         ]
         place_and_path = (tuple(y[8:size]), tuple(y[size:]))
-        axes = np.array(frame.axes(*map(lambda part: tuple(map(jnp.asarray, part)), place_and_path)), dtype=float)
-        centre = np.array(frame.position(*map(lambda part: tuple(map(jnp.asarray, part)), place_and_path)), dtype=float)
+        pose = frame.pose(*map(lambda part: tuple(map(jnp.asarray, part)), place_and_path))
+        axes, centre = np.array(pose.axes, dtype=float), np.array(pose.position, dtype=float)
         motions.append(np.concatenate([y[2:5] @ axes, centre, y[5:8] @ axes / float(scene.body.I3 * 100.0)]))
     assert_close(motions[0], motions[1], atol=1e-10)
 
@@ -178,7 +178,7 @@ def test_a_place_may_be_given_by_its_names_or_as_a_point():
     motion = scene.dynamics.motion(states[0])
     assert_close(jnp.stack(motion.velocity), [0.1, 0.2], atol=1e-15)
     launch = tippe.Launch(0.4, 90.0, place=(mu, eta))
-    t1, t2, n = np.array(scene.frame.axes(*scene.start(launch)), dtype=float)
+    t1, t2, n = np.array(scene.frame.pose(*scene.start(launch)).axes, dtype=float)
     assert_close(n, -point / 0.3, atol=1e-15)
     expected = np.array([1.0, 0.0, 0.0]) - n[0] * n
     assert_close(t1, expected / np.linalg.norm(expected), atol=1e-15)

@@ -62,12 +62,12 @@ def test_forces_and_contact_are_those_of_an_independent_program(name, rolls):
     reference = OnArena(*ODD, ODD_INERTIA, slide, arena=name, p1=0.3 if name == "cylinder" else 0.5, p2=0.3)
     motion = scene.dynamics.motion(states)
     f1, f2 = motion.friction.force
-    frame, rise = scene.frame, scene.dynamics.mass_from_contact(states)
-    place_and_path = (tuple(states[8:-3]), (jnp.zeros(10),) * 4)
-    axes = np.array(jnp.broadcast_arrays(*(part for axis in frame.axes(*place_and_path) for part in axis))).reshape(
-        3, 3, 10
-    )
-    foot = np.array(jnp.broadcast_arrays(*frame.position(*place_and_path)))
+    frame, rise = scene.frame, tuple(-part for part in scene.dynamics.rotation(states)[1])
+    place_and_path = (tuple(states[8:-3]), (jnp.zeros(10),) * (2 if name == "cylinder" else 0))
+    axes = np.array(
+        jnp.broadcast_arrays(*(part for axis in frame.pose(*place_and_path).axes for part in axis))
+    ).reshape(3, 3, 10)
+    foot = np.array(jnp.broadcast_arrays(*frame.pose(*place_and_path).position))
     turning, slip = np.stack(scene.angular_velocity(states)), np.asarray(scene.slip_velocity(states))
     for k, state in enumerate(np.asarray(states).T):
         to_fixed = axes[:, :, k].T

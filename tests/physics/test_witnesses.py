@@ -55,7 +55,7 @@ def random_states(rng, scenes, count):
     I1, I3 = np.asarray(scenes.body.I1), np.asarray(scenes.body.I3)
     L = I1 * w + (I3 - I1) * np.sum(w * e, axis=0) * e
     eta = rng.uniform(-np.pi, np.pi, count)
-    place = jnp.asarray(scenes.frame.at_angle(eta)[0]).reshape(-1, count)
+    place = jnp.asarray(scenes.start(tippe.Launch(0.0, 0.0, eta=eta))[0]).reshape(-1, count)
     return jnp.concatenate([0.4 * rng.normal(size=(2, count)), e, L, place])
 
 

@@ -25,6 +25,6 @@ def random_states(scene: tippe.Scene, count: int, seed: int = 0):
     axis = random.normal(size=(3, count))
     axis /= np.linalg.norm(axis, axis=0)
     momentum = float(scene.body.I3) * 100.0 * random.normal(size=(3, count))
-    place, _ = scene.frame.at_angle(jnp.asarray(random.uniform(-1.2, 1.2, count)))
+    place, _ = scene.start(tippe.Launch(0.0, 0.0, eta=random.uniform(-1.2, 1.2, count)))
     place = np.array(jnp.stack(place)) if place else np.zeros((0, count))
     return jnp.asarray(np.concatenate([random.normal(scale=0.3, size=(2, count)), axis, momentum, place]))

@@ -21,7 +21,7 @@ from nonholonomic.text import shown
 from tippe.friction import Slip
 from tippe.model.body import Top
 from tippe.model.dynamics import AXIS, MOMENTUM, PLACE, VELOCITY
-from tippe.model.scene import Scene
+from tippe.model.scene import Launch, Scene
 
 
 def across(scene: Scene[Top]) -> tuple[Float[Array, ""] | float, float]:
@@ -34,7 +34,7 @@ def across(scene: Scene[Top]) -> tuple[Float[Array, ""] | float, float]:
 
     **Raises:** `ValueError` for an arena that is curved in both directions.
     """
-    curvature, slope = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).frame_rate
+    curvature, slope = scene.frame.frame_motion(scene.start(Launch(0.0, 0.0))[0], (1.0, 0.0)).frame_rate
     if slope is not None:
         raise ValueError(f"surface = {shown(scene.surface)} must be a Plane or a Cylinder for these coordinates")
     return (1.0, 0.0) if curvature is None else (1.0 / curvature, 1.0)
@@ -91,7 +91,7 @@ def metric(scene: Scene[Top], q: Float[Array, " 6"]) -> Float[Array, "6 6"]:
 
 def potential(scene: Scene[Top], q: Float[Array, " 6"]) -> Float[Array, ""]:
     """Potential energy [J], up to a constant: weight times the height of the centre of mass; `q` as for `metric`."""
-    place, _ = scene.frame.at_angle(q[0])
+    place, _ = scene.start(Launch(0.0, 0.0, eta=q[0]))
     parts = (jnp.zeros(()) if part is None else jnp.asarray(part) for part in scene.frame.vertical(place))
     vertical = jnp.stack(list(parts))
     height = q[5] * vertical[2] - scene.body.offset * axes(q[2], q[3])[2] @ vertical

@@ -88,7 +88,7 @@ def test_a_top_that_tumbles_steadily_on_the_plane_runs_down_in_a_cylinder():
     for surface in (tippe.Plane(), tippe.Cylinder(0.4)):
         scene = tippe.Scene(SCENE.body, surface, SCENE.friction)
         state = steady.tumbling_state(SCENE, steady.tumbling(SCENE, 1.2))
-        start = np.concatenate([np.asarray(state), np.asarray(scene.frame.at_angle(0.0)[0])])
+        start = np.concatenate([np.asarray(state), np.asarray(scene.start(tippe.Launch(0.0, 0.0))[0])])
         rate = jax.jit(lambda y, scene=scene: scene.field(y))
         np.testing.assert_allclose(scene.slip_velocity(jnp.asarray(start)), 0.0, atol=1e-12)
         run = solve_ivp(

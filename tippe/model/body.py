@@ -87,11 +87,6 @@ class AbstractBody(Bounded):
         """The magnitudes of the moments of inertia across and along the axis [kg m^2]."""
         return self.I1, self.I3
 
-    def mass_from_frame(self, axis: Vector) -> Vector:
-        """Vector from the point with which the frame moves to the centre of mass [m], in (t1, t2, n)."""
-        r1, r2, r3 = self.meridian.at(axis[2]).contact(axis)
-        return (-r1, -r2, -r3 - self.size)
-
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
         yield Bound(self.I3, "I3", at_most=2.0 * self.I1, why="I3 <= 2 I1 for every rigid body")
@@ -115,12 +110,9 @@ Moments = tuple[Number, Number, Number, Number]
 def truncated_ball(radius: Number, cut: Number) -> Moments:
     """A ball about the origin without the part above z = `cut`: r^2 = radius^2 - z^2 from -radius to `cut`."""
 
-    def integrals(z: Number) -> tuple[Number, Number]:
-        """The integrals over r^4 and over r^2 z^2."""
-        fourth = radius**4 * z - 2.0 * radius**2 * z**3 / 3.0 + z**5 / 5.0
-        return fourth, radius**2 * z**3 / 3.0 - z**5 / 5.0
-
-    (fourth_to, vertical_to), (fourth_from, vertical_from) = integrals(cut), integrals(-radius)
+    # The integrals over r^4 and over r^2 z^2, up to `cut` and up to the lowest point.
+    fourth_to, fourth_from = (radius**4 * z - 2.0 * radius**2 * z**3 / 3.0 + z**5 / 5.0 for z in (cut, -radius))
+    vertical_to, vertical_from = (radius**2 * z**3 / 3.0 - z**5 / 5.0 for z in (cut, -radius))
     axial = jnp.pi / 2.0 * (fourth_to - fourth_from)
     volume = jnp.pi * (2.0 * radius**3 / 3.0 + radius**2 * cut - cut**3 / 3.0)
     first = -jnp.pi / 4.0 * (radius**2 - cut**2) ** 2
@@ -243,12 +235,12 @@ class Stem(Bounded):
 
     units: ClassVar[dict[str, str]] = {"radius": "m", "offset": "m"}
 
-    radius: Float[Array, "..."] = eqx.field(converter=as_number)
-    offset: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.radius, "stem radius", above=0.0)
-        yield Bound(self.offset, "stem offset", above=0.0)
+    radius: Float[Array, "..."] = eqx.field(
+        converter=as_number, metadata={"range": {"above": 0.0, "name": "stem radius"}}
+    )
+    offset: Float[Array, "..."] = eqx.field(
+        converter=as_number, metadata={"range": {"above": 0.0, "name": "stem offset"}}
+    )
 
 
 class Top(AbstractBody):
@@ -401,9 +393,6 @@ class Top(AbstractBody):
         if self.stem is None:
             return jnp.full(jnp.shape(self.radius), jnp.nan)
         return jnp.arccos((self.stem.radius - self.radius) / (self.stem.offset - self.offset))
-
-    def mass_from_frame(self, axis: Vector) -> Vector:
-        return (-self.offset * axis[0], -self.offset * axis[1], -self.offset * axis[2])
 
     def suspicion(self) -> str | None:
         if is_traced(self):

@@ -185,6 +185,19 @@ class AbstractDynamics(eqx.Module):
 class AbstractContactDynamics(AbstractDynamics):
     """Equations of motion of a body on a single contact, which ends as one of `LOSSES`."""
 
+    @abc.abstractmethod
+    def rotation(self, state: States) -> tuple[Vector, Vector]:
+        """Angular velocity of the body [rad/s], and the vector r from its centre of mass to the contact [m], in the
+        moving frame."""
+
+    def normal_spin(self, state: States) -> Float[Array, "..."]:
+        """Angular velocity about the arena's normal [rad/s]."""
+        return self.rotation(state)[0][2]
+
+    def carried_along(self, state: States) -> States:
+        """The state with the velocity that the law of the contact imposes; only rolling imposes a velocity."""
+        return state
+
     def margins(self, state: States) -> tuple[Float[Array, "..."], ...]:
         """The margin for each of `LOSSES`: the normal force as a fraction of the weight, plus a round-off allowance for
         a start with N = 0; the excess of the Painlevé factor over `JAMMED`; and the excess of the room over `FITS`, if
@@ -205,8 +218,11 @@ class AbstractRollingDynamics(AbstractContactDynamics):
     """Equations of motion of a body whose contact point is at rest on the arena.
 
     Friction is the force that rolling requires; the caller must check whether the friction law allows it (`grip`). The
-    velocity follows from axis and angular momentum; its two components in the state are integrated but not used.
+    velocity, r x w with r from the centre of mass to the contact, follows from axis and angular momentum; its two
+    components in the state are integrated but not used.
     """
+
+    body: eqx.AbstractVar[Any]
 
     @abc.abstractmethod
     def evaluate(self, state: Components) -> tuple[Motion, Vector]:
@@ -226,6 +242,53 @@ class AbstractRollingDynamics(AbstractContactDynamics):
         """
         F1, F2, N = self.evaluate(state)[1]
         return (mu * N - length(F1, F2)) / self.weight
+
+    @abc.abstractmethod
+    def over_inertia(self, state: Components, lever: Vector, torque: Vector) -> Vector:
+        """Solution x of (J + m (r^2 - r r^T)) x = torque in the moving frame, with the inertia J about the centre of mass
+        and the vector r from there to the contact."""
+
+    @abc.abstractmethod
+    def with_unit_axes(self, state: States) -> States:
+        """The state with the body's axes at unit length, and at right angles."""
+
+    def carried_along(self, state: States) -> States:
+        w, r = self.rotation(state)
+        return state.at[VELOCITY].set(jnp.stack(jnp.broadcast_arrays(*cross(r, w)[:2], state[0])[:2]))
+
+    def with_slip(self, state: States, slip: Slip) -> States:
+        """The state after an impulse at the contact that gives the contact point the given velocity along the arena.
+
+        The angular momentum about the contact, K = L - m r x u, does not change in the impulse: w solves (J + m (r^2 -
+        r r^T)) w = K + m r x v, u = r x w + v, and L = K + m r x u. Jellett's quantity is constant, and an impulse that
+        stops the slip dissipates the energy of v in the metric of the contact's inertia.
+
+        **Arguments:**
+
+        - `state`: (8 + the arena's place, ...).
+        - `slip`: velocity v of the contact point after the impulse [m/s].
+
+        **Returns:** the state, of the same shape.
+        """
+        (w, r), (u, e, L, place) = self.rotation(state), parts(state)
+        m, v, swing = self.body.mass, (slip.x, slip.y, None), cross(r, w)
+        about_contact = sum_vectors(L, scale(-m, cross(r, (*u, swing[2]))))
+        u = sum_vectors(cross(r, self.over_inertia(state, r, sum_vectors(about_contact, scale(m, cross(r, v))))), v)
+        return joined(u[:2], e, sum_vectors(about_contact, scale(m, cross(r, u))), place)
+
+    def unit_impulse(self, state: States, axis: int) -> tuple[Component, ...]:
+        """The impulse at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena
+        [N s].
+
+        **Arguments:**
+
+        - `state`: (8 + the arena's place, ...); `axis`: 0 for t1, 1 for t2.
+        """
+        _, r = self.rotation(state)
+        unit = jnp.ones_like(state[0])
+        v = (unit, None, None) if axis == 0 else (None, unit, None)
+        w = self.over_inertia(state, r, scale(self.body.mass, cross(r, v)))
+        return scale(self.body.mass, sum_vectors(cross(r, w), v))
 
 
 #: The cosine of no angle, for runs without a target angle.
@@ -278,6 +341,11 @@ class Dynamics(AbstractContactDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.mass * self.gravity
 
+    def rotation(self, state: States) -> tuple[Vector, Vector]:
+        _, e, L, _ = parts(state)
+        w = sum_vectors(scale(self.per_transverse, L), scale(self.axial_excess * dot(L, e), e))
+        return w, self.meridian.at(e[2]).contact(e)
+
     def unloaded(self, state: States, scales: States) -> Bool[Array, "..."] | None:
         # On a level plane, N = 0 can last only for an instant.
         frame = self.frame
@@ -304,7 +372,7 @@ class Dynamics(AbstractContactDynamics):
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
         changing = multiply(growth, e_dot[2])
         path = (add(V[0], multiply(changing, e[0])), add(V[1], multiply(changing, e[1])))
-        o, up, place_rate, room = self.frame.frame_motion(place, path)
+        o, up, place_rate, room, _ = self.frame.frame_motion(place, path)
 
         spin_momentum = dot(L, e)
         along_axis = self.axial_excess * spin_momentum
@@ -368,11 +436,9 @@ class RollingDynamics(AbstractRollingDynamics):
     def weight(self) -> Float[Array, "..."]:
         return self.body.mass * self.gravity
 
-    def carried_along(self, state: States) -> States:
-        """The state with the velocity that follows from axis and angular momentum of the rolling top."""
-        _, e, L, place = parts(state)
-        u = cross(self.body.meridian.contact(e), angular_velocity(self.body, e, L))
-        return joined(u[:2], e, L, place)
+    def rotation(self, state: States) -> tuple[Vector, Vector]:
+        _, e, L, _ = parts(state)
+        return angular_velocity(self.body, e, L), self.body.meridian.contact(e)
 
     def evaluate(self, state: Components) -> tuple[Motion, Vector]:
         """The motion and the reaction F.
@@ -386,7 +452,7 @@ class RollingDynamics(AbstractRollingDynamics):
         w = angular_velocity(self.body, e, L)
         e_dot = cross(w, e)
         V: Tangent = (R * w[1], -R * w[0])
-        o, up, place_rate, room = self.frame.frame_motion(place, V)
+        o, up, place_rate, room, _ = self.frame.frame_motion(place, V)
         r = self.body.meridian.contact(e)
         # n' = -(o1 t1 + o2 t2), and r' as a vector, not as the rate of its components.
         r_dot = sum_vectors(scale(a, e_dot), scale(R, (*o, None)))
@@ -394,7 +460,7 @@ class RollingDynamics(AbstractRollingDynamics):
 
         steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, up))
         torque = sum_vectors(scale(m, cross(r, steady_push)), cross(L, w))
-        w_dot = self._over_inertia(e, r, torque)
+        w_dot = self.over_inertia(state, r, torque)
         push = sum_vectors(steady_push, cross(r, w_dot))
 
         u1_dot = add(push[0], multiply(-self.gravity, up[0]), multiply(o[0], u[2]))
@@ -408,62 +474,14 @@ class RollingDynamics(AbstractRollingDynamics):
         slip = Slip(zero, zero, (w[0], w[1], None))
         return Motion(rate, F[2], load, slip, V, o, dot(L, e), 1.0 + zero, room), F
 
-    def with_slip(self, state: States, slip: Slip) -> States:
-        """The state after an impulse at the contact that gives the contact point the given velocity along the arena.
-
-        The angular momentum about the contact, K = L - m r x u, does not change in the impulse: w solves (J + m (r^2 -
-        r r^T)) w = K + m r x v, and u = r x w + v. Jellett's quantity is constant, and an impulse that stops the slip
-        dissipates the energy of v in the metric of the contact's inertia.
-
-        **Arguments:**
-
-        - `state`: (8 + the arena's place, ...).
-        - `slip`: velocity v of the contact point after the impulse [m/s].
-
-        **Returns:** the state, of the same shape.
-        """
-        (u1, u2), e, L, place = parts(state)
-        r = self.body.meridian.contact(e)
-        e_dot = cross(angular_velocity(self.body, e, L), e)
-        u = (u1, u2, multiply(-self.body.offset, e_dot[2]))
-        v = (slip.x, slip.y, None)
-        lever = cross(r, sum_vectors(v, scale(-1.0, u)))
-        w = self._over_inertia(e, r, sum_vectors(L, scale(self.body.mass, lever)))
-        u = sum_vectors(cross(r, w), v)
-        axial_rate = dot(w, e)
-        L = sum_vectors(scale(self.body.I1, w), scale((self.body.I3 - self.body.I1) * axial_rate, e))
-        return joined(u[:2], e, L, place)
-
     def with_unit_axes(self, state: States) -> States:
-        """The state with the axis at unit length."""
         axis = state[AXIS]
         return state.at[AXIS].set(axis / jnp.sqrt(jnp.sum(axis * axis, axis=0)))
 
-    def unit_impulse(self, state: States, axis: int) -> tuple[Component, ...]:
-        """The impulse at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena
-        [N s].
-
-        **Arguments:**
-
-        - `state`: (8 + the arena's place, ...); `axis`: 0 for t1, 1 for t2.
-        """
-        e = parts(state).axis
-        r, unit = self.body.meridian.contact(e), jnp.ones_like(state[0])
-        v = (unit, None, None) if axis == 0 else (None, unit, None)
-        w = self._over_inertia(e, r, scale(self.body.mass, cross(r, v)))
-        return scale(self.body.mass, sum_vectors(cross(r, w), v))
-
-    def angular_velocity(self, state: States) -> Vector:
-        """Angular velocity of the body [rad/s] in the moving frame."""
-        _, e, L, _ = parts(state)
-        return angular_velocity(self.body, e, L)
-
-    def _over_inertia(self, e: Vector, r: Vector, torque: tuple[Component, ...]) -> Vector:
-        """Solution x of (J + m (r^2 - r r^T)) x = torque, J = I1 + (I3 - I1) e e^T.
-
-        With A = I1 + m r^2, A x = torque - (I3 - I1) (e.x) e + m (r.x) r; its products with e and r are two equations for
-        e.x and r.x, whose determinant is positive.
-        """
+    def over_inertia(self, state: Components, lever: Vector, torque: Vector) -> Vector:
+        # J = I1 + (I3 - I1) e e^T. With A = I1 + m r^2, A x = torque - (I3 - I1) (e.x) e + m (r.x) r; its products with e
+        # and r are two equations for e.x and r.x, whose determinant is positive.
+        e, r = parts(state).axis, lever
         m, I1, I3 = self.body.mass, self.body.I1, self.body.I3
         excess, r2, er = I3 - I1, dot(r, r), dot(e, r)
         te, tr = dot(torque, e), dot(torque, r)

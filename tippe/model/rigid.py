@@ -50,7 +50,6 @@ from .dynamics import (
     AbstractRollingDynamics,
     Motion,
     from_frame,
-    joined,
     parts,
     to_frame,
 )
@@ -181,34 +180,30 @@ class SymmetricMatrix(NamedTuple):
         )
 
     @property
-    def adjugate(self) -> "SymmetricMatrix":
-        """The matrix of the cofactors."""
+    def cofactors(self) -> tuple["SymmetricMatrix", Float[Array, "..."]]:
+        """The matrix of the cofactors, and the determinant."""
         xx, yy, zz, xy, xz, yz = self
         diagonal = (yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy)
-        return SymmetricMatrix(*diagonal, xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - yz * xx)
-
-    def determinant(self, adjugate: "SymmetricMatrix") -> Float[Array, "..."]:
-        """The determinant, from the cofactors."""
-        return self.xx * adjugate.xx + self.xy * adjugate.xy + self.xz * adjugate.xz
+        adjugate = SymmetricMatrix(*diagonal, xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - yz * xx)
+        return adjugate, xx * adjugate.xx + xy * adjugate.xy + xz * adjugate.xz
 
     @property
     def inverse(self) -> "SymmetricMatrix":
         """The inverse."""
-        adjugate = self.adjugate
-        determinant = self.determinant(adjugate)
+        adjugate, determinant = self.cofactors
         return SymmetricMatrix(*(cofactor / determinant for cofactor in adjugate))
 
     def solve(self, right: Vector) -> Vector:
         """Solution x of A x = right."""
-        adjugate = self.adjugate
-        return scale(1.0 / self.determinant(adjugate), adjugate.times(right))
+        adjugate, determinant = self.cofactors
+        return scale(1.0 / determinant, adjugate.times(right))
 
     @property
     def principal_minors(self) -> tuple[Float[Array, "..."], ...]:
         """The seven principal minors, from one row to three rows; all are nonnegative if the matrix is positive
         semidefinite."""
-        adjugate = self.adjugate
-        return (*self[:3], *adjugate[:3], self.determinant(adjugate))
+        adjugate, determinant = self.cofactors
+        return (*self[:3], *adjugate[:3], determinant)
 
 
 #: Number of directions in which a support function is evaluated to check that the body is convex.
@@ -507,12 +502,11 @@ class ContactMotion(NamedTuple):
     """The motion of the contact point.
 
     - `normal_rate`, `lever_rate`: rates of change of the components of n and of r in the body's axes.
-    - `contact_velocity`: velocity of the contact point along the arena [m/s]; `frame`: motion of the frame.
+    - `frame`: motion of the frame and of the contact point along the arena.
     """
 
     normal_rate: Vector
     lever_rate: Vector
-    contact_velocity: Tangent
     frame: FrameMotion
 
 
@@ -547,40 +541,20 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         over_body, axes = from_frame(lever_rate, attitude.axes), attitude.axes
         V1, V2 = add(slip[0], over_body[0]), add(slip[1], over_body[1])
         if isinstance(self.frame, PlaneFrame):
-            return ContactMotion(normal_rate, lever_rate, (V1, V2), self.frame.frame_motion(place, (V1, V2)))
+            return ContactMotion(normal_rate, lever_rate, self.frame.frame_motion(place, (V1, V2)))
         # If n turns along a tangent, the contact moves against it over the body, by H.
         tangents = [tuple(axis[k] for axis in axes) for k in (0, 1)]
         first, second = (from_frame(self.body.contact(attitude.normal, t)[1], axes) for t in tangents)
         H11, H12, H22, V1, V2 = stored(-first[0], -first[1], -second[1], V1, V2)
-        frame, path = self.frame.convex_motion(place, (V1, V2), (H11, H12, H22))
-        path = stored(*path)
+        frame = self.frame.frame_motion(place, (V1, V2), (H11, H12, H22))
+        path = stored(*frame.contact_velocity)
         frame_part = to_frame((subtract(None, frame.frame_rate[0]), subtract(None, frame.frame_rate[1]), None), axes)
         lever_rate = to_frame((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None), axes)
-        return ContactMotion(sum_vectors(normal_rate, frame_part), lever_rate, path, frame)
+        return ContactMotion(sum_vectors(normal_rate, frame_part), lever_rate, frame._replace(contact_velocity=path))
 
-    def angular_velocity(self, state: States) -> Vector:
-        """Angular velocity of the body in the frame [rad/s]."""
+    def rotation(self, state: States) -> tuple[Vector, Vector]:
         attitude = self.attitude(state)
-        return from_frame(attitude.angular_velocity, attitude.axes)
-
-    def mass_from_contact(self, state: States) -> Vector:
-        """Vector from the contact to the centre of mass [m], in the frame."""
-        attitude = self.attitude(state)
-        return scale(-1.0, from_frame(attitude.lever, attitude.axes))
-
-    def energy(self, state: States) -> Float[Array, "..."]:
-        """Kinetic energy plus weight times the height of the centre of mass [J]."""
-        (u1, u2), _, _, place = parts(self.carried_along(state))
-        (_, normal, momentum, w, lever, _), place = self.attitude(state), place[:-3]
-        vertical_speed = -dot(w, cross(lever, normal))
-        rotation = 0.5 * dot(w, momentum)
-        height = add(self.frame.height(place), dot(self.mass_from_contact(state), self.frame.vertical(place)))
-        return self.body.mass * (0.5 * (u1**2 + u2**2 + vertical_speed**2) + self.gravity * height) + rotation
-
-    def normal_spin(self, state: States) -> Float[Array, "..."]:
-        """Angular velocity about the arena's normal [rad/s]."""
-        attitude = self.attitude(state)
-        return dot(attitude.angular_velocity, attitude.normal)
+        return from_frame(attitude.angular_velocity, attitude.axes), from_frame(attitude.lever, attitude.axes)
 
     def carried_rates(
         self,
@@ -597,7 +571,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         [m/s]; `torque`: L' [N m].
         """
         _, e, L, place = parts(state)
-        o, up, place_rate, _ = contact.frame
+        o, up, place_rate, _, _ = contact.frame
         # The body's axes turn with it.
         (x, y, z), (w1, w2, w3) = attitude.axes, attitude.angular_velocity
         x_rate = tuple(w3 * b - w2 * c for b, c in zip(y, z, strict=True))
@@ -606,10 +580,6 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         u2_dot = add(push[1], multiply(-self.gravity, up[1]), multiply(o[1], rise))
         e_dot, L_dot = sum_vectors(z_rate, rate_in_frame(e, o)), sum_vectors(torque, rate_in_frame(L, o))
         return (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate, *sum_vectors(x_rate, rate_in_frame(place[-3:], o)))
-
-    def carried_along(self, state: States) -> States:
-        """The state with the velocity that the friction law imposes; only `NoSlip` imposes a velocity."""
-        return state
 
 
 class RigidSlipping(AbstractRigidDynamics):
@@ -630,7 +600,7 @@ class RigidSlipping(AbstractRigidDynamics):
         r, swing = from_frame(lever, axes), from_frame(cross(w, lever), axes)
         slip_x, slip_y = stored(u1 + swing[0], u2 + swing[1])
         contact = self.contact_motion(place[:-3], attitude, (slip_x, slip_y))
-        o, up, _, room = contact.frame
+        o, up, _, room, path = contact.frame
         slip = Slip(slip_x, slip_y, from_frame(w, axes))
         friction = self.friction.per_normal_force(slip)
         f1, f2 = friction.force
@@ -649,10 +619,10 @@ class RigidSlipping(AbstractRigidDynamics):
         push = (multiply(thrust, f1), multiply(thrust, f2))
         u3 = None if o == (None, None) else -dot(w, rise)
         rates = self.carried_rates(state, attitude, contact, push, u3, scale(N, moment))
-        return Motion(rates, N, friction, slip, contact.contact_velocity, o, w[2], painleve_factor, room)
+        return Motion(rates, N, friction, slip, path, o, w[2], painleve_factor, room)
 
 
-class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
+class RigidRolling(AbstractRigidDynamics, AbstractRollingDynamics):
     """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself."""
 
     def evaluate(self, state: Components) -> tuple[Motion, Vector]:
@@ -664,7 +634,7 @@ class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
         place, attitude = parts(state).place, self.attitude(state)
         m, r, w = self.body.mass, attitude.lever, attitude.angular_velocity
         contact = self.contact_motion(place[:-3], attitude, (None, None))
-        o, up, _, room = contact.frame
+        o, up, _, room, path = contact.frame
         r_dot = sum_vectors(contact.lever_rate, cross(w, r))
         steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, to_frame(up, attitude.axes)))
         torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, steady_push)))
@@ -678,7 +648,7 @@ class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
         zero = jnp.zeros_like(F[2])
         slip = Slip(zero, zero, from_frame(w, attitude.axes))
-        return Motion(rates, F[2], load, slip, contact.contact_velocity, o, w[2], 1.0 + zero, room), F
+        return Motion(rates, F[2], load, slip, path, o, w[2], 1.0 + zero, room), F
 
     def _about_contact(self, lever: Vector) -> SymmetricMatrix:
         """The inertia about the contact, J + m (r^2 - r r^T), in the body's axes."""
@@ -692,34 +662,12 @@ class RigidRolling(AbstractRollingDynamics, AbstractRigidDynamics):
             inertia.yz - m * r[1] * r[2],
         )
 
-    def with_slip(self, state: States, slip: Slip) -> States:
-        """As `RollingDynamics.with_slip`."""
-        (u1, u2), e, _, place = parts(state)
-        attitude = self.attitude(state)
-        r, w, m = attitude.lever, attitude.angular_velocity, self.body.mass
-        # In the body's axes: the velocity u of the centre of mass, and v.
-        u = to_frame((u1, u2, -dot(w, cross(r, attitude.normal))), attitude.axes)
-        v = to_frame((slip.x, slip.y, None), attitude.axes)
-        jump = sum_vectors(v, scale(-1.0, u))
-        w = self._about_contact(r).solve(sum_vectors(attitude.momentum, scale(m, cross(r, jump))))
-        u = from_frame(sum_vectors(cross(r, w), v), attitude.axes)
-        return joined(u[:2], e, from_frame(self.body.inertia.tensor.times(w), attitude.axes), place)
-
-    def unit_impulse(self, state: States, axis: int) -> tuple[Component, ...]:
-        """As `RollingDynamics.unit_impulse`."""
-        attitude = self.attitude(state)
-        v = tuple(part[axis] for part in attitude.axes)
-        w = self._about_contact(attitude.lever).solve(scale(self.body.mass, cross(attitude.lever, v)))
-        return scale(self.body.mass, from_frame(sum_vectors(cross(attitude.lever, w), v), attitude.axes))
+    def over_inertia(self, state: Components, lever: Vector, torque: Vector) -> Vector:
+        axes = self.attitude(state).axes
+        solution = self._about_contact(to_frame(lever, axes)).solve(to_frame(torque, axes))
+        return from_frame(solution, axes)
 
     def with_unit_axes(self, state: States) -> States:
-        """The state with the body's axes at unit length and at right angles."""
         e, x = state[AXIS] / jnp.linalg.norm(state[AXIS], axis=0), state[-3:]
         x = x - jnp.sum(e * x, axis=0) * e
         return state.at[AXIS].set(e).at[-3:].set(x / jnp.linalg.norm(x, axis=0))
-
-    def carried_along(self, state: States) -> States:
-        """The state with the velocity r x w of the centre of mass."""
-        attitude = self.attitude(state)
-        u = from_frame(cross(attitude.lever, attitude.angular_velocity), attitude.axes)
-        return state.at[:2].set(jnp.stack(jnp.broadcast_arrays(*u[:2], state[0])[:2]))

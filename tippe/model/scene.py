@@ -13,18 +13,18 @@ from jaxtyping import Array, ArrayLike, Float
 from nonholonomic.geometry import (
     AbstractFrame,
     AbstractSurface,
-    CarriedFrame,
     Component,
+    Cylinder,
     Plane,
     PlaneFrame,
     Sphere,
+    Torus,
     Vector,
     cross,
     dot,
     frame_of,
     none_if_zero,
     place_named,
-    room_bounds,
     scale,
     sum_vectors,
 )
@@ -40,14 +40,13 @@ from .dynamics import (
     TURNING,
     Dynamics,
     RollingDynamics,
-    angular_velocity,
     from_frame,
     inclination,
     joined,
     parts,
     to_frame,
 )
-from .rigid import AbstractRigidBody, AbstractRigidDynamics, RigidRolling, RigidSlipping, several
+from .rigid import AbstractRigidBody, RigidRolling, RigidSlipping, several
 from .stick_slip import StickSlip
 
 #: Spins above this [rad/s] suggest revolutions per minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
@@ -289,13 +288,15 @@ class Scene(Bounded, Generic[Body]):
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
-        if not isinstance(self.surface, Plane):
-            # The radius that a closed arena must exceed so that the body can be inside.
+        surface = self.surface
+        if isinstance(surface, Cylinder | Sphere | Torus) and surface.sign(self.side, "inside") < 0.0:
+            # The radius that the arena must exceed so that the body fits inside.
             room = self.body.size
             if isinstance(self.body, AbstractRigidBody):
                 lowest, highest = self.body.half_widths
-                room = highest if isinstance(self.surface, Sphere) else lowest
-            yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), room)
+                room = highest if isinstance(surface, Sphere) else lowest
+            name = "tube" if isinstance(surface, Torus) else "radius"
+            yield Bound(getattr(surface, name), f"surface {name}", above=room, why="the body must fit inside")
 
     def suspicion(self) -> str | None:
         for name, value in numbers("surface", self.surface, functions=False).items():
@@ -310,10 +311,9 @@ class Scene(Bounded, Generic[Body]):
         """The moving frame of the body on the arena; that of an `Ellipsoid` or a `RigidBody` moves with the contact point."""
         distance = jnp.zeros(()) if isinstance(self.body, AbstractRigidBody) else self.body.size
         side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.size)
-        if self.contact == "hybrid" and not self.flies_in_closed_form:
-            # A flight can take the top anywhere, so use the frame that stores its position.
-            return CarriedFrame.of(self.surface, distance, pull, side)
-        return frame_of(self.surface, side, distance, pull)
+        # A flight can take the top anywhere, so it needs the frame that stores its position.
+        flies = self.contact == "hybrid" and not self.flies_in_closed_form
+        return frame_of(self.surface, side, distance, pull, carried=flies)
 
     @property
     def has_stem(self) -> bool:
@@ -337,25 +337,17 @@ class Scene(Bounded, Generic[Body]):
         `AbstractRigidDynamics`."""
         body, frame, friction, gravity = self.body, self.frame, self.friction, self.gravity
         if isinstance(body, AbstractRigidBody):
-            arguments = (frame, body, gravity, body.inertia.tensor.inverse)
-            rolling = RigidRolling(*arguments)
+            parts_of_scene = {"frame": frame, "body": body, "gravity": gravity, "inverse": body.inertia.tensor.inverse}
+            rolling = RigidRolling(**parts_of_scene)
             if isinstance(friction, NoSlip):
                 return rolling
-            slipping = RigidSlipping(*arguments, friction, 1.0 / body.mass)
+            slipping = RigidSlipping(**parts_of_scene, friction=friction, per_mass=1.0 / body.mass)
             return StickSlip(slipping, rolling, friction.mu) if isinstance(friction, SetValuedCoulomb) else slipping
         slipping = Dynamics.of(body, frame, friction, gravity)
         if not isinstance(friction, SetValuedCoulomb):
             return slipping
         assert isinstance(body, Top)
-        return StickSlip(slipping, RollingDynamics(frame, body, gravity), friction.mu)
-
-    @property
-    def _rigid_dynamics(self) -> AbstractRigidDynamics:
-        """The equations of motion of a rigid body; if it can both slip and roll, the equations of slipping."""
-        equations = self.dynamics
-        equations = equations.slipping if isinstance(equations, StickSlip) else equations
-        assert isinstance(equations, AbstractRigidDynamics)
-        return equations
+        return StickSlip(slipping, RollingDynamics(frame=frame, body=body, gravity=gravity), friction.mu)
 
     @property
     def turning_dynamics(self) -> Any:
@@ -404,9 +396,11 @@ class Scene(Bounded, Generic[Body]):
 
     def start(self, launch: Launch) -> tuple[tuple[Component, ...], tuple[Component, ...]]:
         """Place and cyclic coordinates of the frame at the start of a run."""
-        if launch.place is None:
-            return self.frame.at_angle(launch.eta)
-        return self.frame.at_foot(self.surface.chart(place_named(self.surface, launch.place))[0])
+        place, zero = launch.place, jnp.zeros_like(launch.eta)
+        if place is None:
+            place = tuple(launch.eta if name == "eta" else zero for name, _ in self.surface.coordinates)
+        foot = self.surface.chart(place_named(self.surface, place))[0]
+        return self.frame.start(foot, along_eta=launch.place is None)
 
     def state(self, launch: Launch) -> States:
         """The state at the start of a run (see `dynamics.py` for its components).
@@ -428,7 +422,7 @@ class Scene(Bounded, Generic[Body]):
             axes = (c, cross(e, c), e)
             w = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
             L = from_frame(body.inertia.tensor.times(to_frame(w, axes)), axes)
-            return self._rigid_dynamics.carried_along(joined(u, e, L, place, c))
+            return self.dynamics.carried_along(joined(u, e, L, place, c))
         L = scale(body.I3 * launch.spin, e)
         if launch.angular_velocity is not None:
             w = launch.angular_velocity
@@ -487,16 +481,19 @@ class Scene(Bounded, Generic[Body]):
 
     def energy(self, state: States) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
-        body, dynamics = self.body, self.dynamics
-        if isinstance(body, AbstractRigidBody):
-            return self._rigid_dynamics.energy(state)
-        (u1, u2), e, L, place = parts(state)
-        e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1
-        speed2 = u1**2 + u2**2 + (body.meridian.at(e[2]).offset * e3_dot) ** 2
-        axial = dot(L, e)
-        rotation = (dot(L, L) - axial**2) / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
-        height = dynamics.frame.height(place) + dot(body.mass_from_frame(e), dynamics.frame.vertical(place))
-        return 0.5 * body.mass * speed2 + rotation + body.mass * self.gravity * height
+        mass, dynamics = self.body.mass, self.dynamics
+        (u1, u2), _, L, place = parts(dynamics.carried_along(state))
+        w, r = dynamics.rotation(state)
+        # The contact point has no velocity along the normal.
+        u3 = cross(r, w)[2]
+        frame, place = dynamics.frame, place[: len(dynamics.frame.lengths)]
+        height = frame.height(place) + dot(self._mass_from_frame(r), frame.vertical(place))
+        return mass * (0.5 * (u1**2 + u2**2 + u3**2) + self.gravity * height) + 0.5 * dot(w, L)
+
+    def _mass_from_frame(self, lever: Vector) -> Vector:
+        """Vector from the point with which the frame moves to the centre of mass [m], given the vector from there to the
+        contact."""
+        return (-lever[0], -lever[1], -lever[2] - self.frame.distance)
 
     def jellett(self, state: States) -> Float[Array, "..."]:
         """Jellett's quantity L.(R n - a e) [kg m^3/s]: for a sphere on the plane, constant under every friction at the
@@ -505,11 +502,7 @@ class Scene(Bounded, Generic[Body]):
         On a curved arena it changes at the rate R L.n', and a contact torque N tau changes it at the rate N tau.(R n -
         a e) (`tippe.md`, section 2).
         """
-        _, e, L, _ = parts(state)
-        if isinstance(self.body, AbstractRigidBody):
-            return dot(L, self._rigid_dynamics.mass_from_contact(state))
-        lever = self.body.meridian.at(e[2])
-        return lever.radius * L[2] - lever.offset * dot(e, L)
+        return -dot(parts(state).momentum, self.dynamics.rotation(state)[1])
 
     def theta(self, state: States) -> Float[Array, "..."]:
         """Angle [rad] from the arena's normal to the axis, in [0, pi]."""
@@ -524,18 +517,14 @@ class Scene(Bounded, Generic[Body]):
 
     def angular_velocity(self, state: States) -> Vector:
         """Angular velocity of the body in the moving frame [rad/s]."""
-        if isinstance(self.body, AbstractRigidBody):
-            return self._rigid_dynamics.angular_velocity(state)
-        _, e, L, _ = parts(state)
-        return angular_velocity(self.body, e, L)
+        return self.dynamics.rotation(state)[0]
 
     def path_from_frame(self, state: States) -> Vector:
         """Vector from the point with which the frame moves to the point whose path is reported [m], in the moving
         frame."""
-        if isinstance(self.body, AbstractRigidBody):
-            return self._rigid_dynamics.mass_from_contact(state)
         # The path of a top is that of its sphere's centre, with which the frame moves.
-        return (None, None, None) if isinstance(self.body, Top) else self.body.mass_from_frame(parts(state).axis)
+        is_top = isinstance(self.body, Top)
+        return (None, None, None) if is_top else self._mass_from_frame(self.dynamics.rotation(state)[1])
 
 
 def generic_direction(scene: Scene, launch: Launch, cells: int) -> States:

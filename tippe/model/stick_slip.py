@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.polynomial import Polynomial, legendre
 
 from nonholonomic.compilation.xla_cpu import greatest
-from nonholonomic.geometry import AbstractFrame
+from nonholonomic.geometry import AbstractFrame, Vector
 from nonholonomic.integration import Components, States
 
 from ..friction import Frictionless, Slip, length
@@ -227,7 +227,7 @@ class _Contact(eqx.Module):
         load_change = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
         yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)
         rise = (greatest(-grip, 0.0) * weight / yields, greatest(-grip_rate, 0.0) * weight / (2.0 * yields))
-        spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
+        spin = jnp.sqrt(sum(x * x for x in rolling.rotation(state)[0]))
         unit = 1.0 / jnp.maximum(spin, stick_slip.speed / rolling.body.size)
         inverse_mass = (c / determinant, -b / determinant, a / determinant)
         return cls(d, rise, inverse_mass, load_change, mu, N + load_change[0] * F1 + load_change[1] * F2, unit)
@@ -344,9 +344,8 @@ class StickSlip(AbstractContactDynamics):
         """Whether the contact is at rest."""
         return self.slip_speed(state) <= AT_REST * self.speed
 
-    def normal_spin(self, state: States) -> Float[Array, "..."]:
-        """Angular velocity of a rigid body about the arena's normal [rad/s]."""
-        return self.rolling.angular_velocity(state)[2]
+    def rotation(self, state: States) -> tuple[Vector, Vector]:
+        return self.slipping.rotation(state)
 
     def stopped(self, state: States) -> States:
         """The state after the impulse that stops the slip, with the body's axes at unit length.

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.compilation.cache import padded
-from nonholonomic.geometry import Component, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
+from nonholonomic.geometry import Component, Pose, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution
 from nonholonomic.integration.dense import all_crossings
@@ -206,7 +206,7 @@ class AbstractTrajectory(AbstractRun):
     @of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the position from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.frame.angle(self._place, self._path)
+        return self._pose.angle
 
     @of_each_run
     def azimuth(self) -> Float[Array, " times"]:
@@ -242,8 +242,8 @@ class AbstractTrajectory(AbstractRun):
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre, or of the centre of mass for other bodies [m]; the plane is z = 0, the
         cylinder's axis x = z = 0, and a run on the plane starts above the origin."""
-        frame, places = self.scene.frame, (self._place, self._path)
-        centre = sum_vectors(frame.position(*places), scale(self.above[0], frame.axes(*places)[2]))
+        pose = self._pose
+        centre = sum_vectors(pose.position, scale(self.above[0], pose.axes[2]))
         path_vector = self.scene.path_from_frame(self.states)
         point = jnp.stack(centre, axis=-1)
         return point if path_vector == (None, None, None) else point + self._fixed(path_vector)
@@ -297,7 +297,7 @@ class AbstractTrajectory(AbstractRun):
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:
         """The arena's unit normal n where the top is, from the arena to the sphere's centre."""
-        return jnp.stack(self.scene.frame.axes(self._place, self._path)[2], axis=-1)
+        return jnp.stack(self._pose.axes[2], axis=-1)
 
     @of_each_run
     def angular_velocity(self) -> Float[Array, "times 3"]:
@@ -321,18 +321,13 @@ class AbstractTrajectory(AbstractRun):
         return jnp.stack([first, jnp.cross(e, first), e], axis=-1)
 
     @property
-    def _path(self) -> tuple[Array, ...]:
-        """The cyclic coordinates of the arena's frame, followed by the vector c of `modes/problems.py`."""
-        return tuple(self.cyclic[:-3])
-
-    @property
-    def _place(self) -> tuple[Array, ...]:
-        place = tuple(self.states[8:])
-        return place[:-3] if isinstance(self.scene.body, AbstractRigidBody) else place
+    def _pose(self) -> Pose:
+        """Where the arena's frame is."""
+        place, path = tuple(self.states[8:]), tuple(self.cyclic[:-3])
+        return self.scene.frame.pose(place[:-3] if isinstance(self.scene.body, AbstractRigidBody) else place, path)
 
     def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
-        axes = self.scene.frame.axes(self._place, self._path)
-        return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
+        return jnp.stack([dot(vector, directions) for directions in zip(*self._pose.axes, strict=True)], axis=-1)
 
     @property
     def _whether_it_turned_over(self) -> str:

@@ -119,8 +119,8 @@ class Trajectory(AbstractTrajectory):
     @of_each_run
     def contact(self) -> Float[Array, "times 3"]:
         """The point at which the top touches the arena [m]."""
-        frame, places = self.scene.frame, (self._place, self._path)
-        foot = sum_vectors(frame.position(*places), scale(-frame.distance, frame.axes(*places)[2]))
+        pose = self._pose
+        foot = sum_vectors(pose.position, scale(-self.scene.frame.distance, pose.axes[2]))
         return jnp.stack(foot, axis=-1)
 
     @of_each_run
