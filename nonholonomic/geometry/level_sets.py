@@ -190,8 +190,13 @@ class AbstractLevel(AbstractGradientSurface):
         return self.level(*position) / jnp.sqrt(dot(gradient, gradient))
 
     def gradient(self, position: Vector) -> Vector:
-        alone = [lambda x, k=k: self.level(*position[:k], x, *position[k + 1 :]) for k in range(3)]
-        return tuple(jax.jvp(along, (x,), (jnp.ones_like(x),))[1] for along, x in zip(alone, position, strict=True))
+        x, y, z = position
+        lines = (
+            (lambda x: self.level(x, y, z), x),
+            (lambda y: self.level(x, y, z), y),
+            (lambda z: self.level(x, y, z), z),
+        )
+        return tuple(jax.jvp(along, (start,), (jnp.ones_like(start),))[1] for along, start in lines)
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> Vector:
         # As for any gradient; these derivatives cost less than its rate.
