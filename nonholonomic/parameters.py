@@ -19,7 +19,7 @@ import numpy as np
 from jax.tree_util import DictKey
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .text import AbstractHeld, Numbers, gathered, is_users, likely, name_of, spread
+from .text import AbstractHeld, Numbers, gathered, likely, name_of, spread
 
 #: The values of a parameter along an axis of a grid.
 Axis = TypeVar("Axis")
@@ -71,16 +71,13 @@ def is_number(leaf: object) -> bool:
     return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.inexact | float)
 
 
-def with_numbers(
-    roots: dict[str, PyTree], values: Mapping[str, ArrayLike], were_checked: bool = False
-) -> dict[str, PyTree]:
+def with_numbers(roots: dict[str, PyTree], values: Mapping[str, ArrayLike]) -> dict[str, PyTree]:
     """The trees with some parameters replaced; the modules check the new values.
 
     **Arguments:**
 
     - `roots`: name -> tree.
     - `values`: dotted name -> number or array of numbers.
-    - `were_checked`: whether the values were checked, so that only a user's own modules check them again.
 
     **Returns:** name -> tree.
 
@@ -90,7 +87,7 @@ def with_numbers(
     unknown = [name for name in values if name not in values_of_names]
     if unknown:
         raise _unknown_axis(unknown[0], [name for name, value in values_of_names.items() if value is not None])
-    return {root: _replaced(root, tree, values, were_checked) for root, tree in roots.items()}
+    return {root: _replaced(root, tree, values) for root, tree in roots.items()}
 
 
 def as_one(values: Any, name: str, kind: type) -> Any:
@@ -198,9 +195,9 @@ def _unknown_axis(name: str, known: list[str]) -> ValueError:
     )
 
 
-def _replaced(name: str, tree: PyTree, values: Mapping[str, Any], were_checked: bool) -> PyTree:
+def _replaced(name: str, tree: PyTree, values: Mapping[str, Any]) -> PyTree:
     if isinstance(tree, AbstractHeld):
-        return type(tree)(_replaced(name, tree.function, values, were_checked))
+        return type(tree)(_replaced(name, tree.function, values))
     changes = {}
     for field in dataclasses.fields(tree):
         path_of_field, value = f"{name}.{field.name}", getattr(tree, field.name)
@@ -211,13 +208,8 @@ def _replaced(name: str, tree: PyTree, values: Mapping[str, Any], were_checked: 
             new = tuple(values.get(entry, part) for entry, part in parts.items())
             changes[field.name] = Numbers(new, value.shape) if isinstance(value, Numbers) else new
         elif isinstance(value, eqx.Module) and any(path.startswith(path_of_field + ".") for path in values):
-            changes[field.name] = _replaced(path_of_field, value, values, were_checked)
-    if not changes or not were_checked or is_users(type(tree)):
-        return dataclasses.replace(tree, **changes) if changes else tree
-    copy = object.__new__(type(tree))
-    for field in dataclasses.fields(tree):
-        object.__setattr__(copy, field.name, changes.get(field.name, getattr(tree, field.name)))
-    return copy
+            changes[field.name] = _replaced(path_of_field, value, values)
+    return dataclasses.replace(tree, **changes) if changes else tree
 
 
 def description(root: str, tree: PyTree) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAI
 from ..parameters import full_name, numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..text import shown
-from ..validation import ArrayOrList, as_number, require_all
+from ..validation import ArrayOrList, require_all
 
 #: A single number, or one for each cell.
 Number: TypeAlias = Array | np.ndarray | float
@@ -70,9 +70,8 @@ class AbstractModel(eqx.Module):
         """The value of a parameter by its full name."""
 
     @abc.abstractmethod
-    def replaced(self, values: dict[str, Any], were_checked: bool = False) -> Self:
-        """The model with other values, scalars or one per cell, of some parameters; the modules check concrete values,
-        unless these were checked."""
+    def replaced(self, values: dict[str, Any]) -> Self:
+        """The model with other values, scalars or one per cell, of some parameters; the modules check concrete values."""
 
     @abc.abstractmethod
     def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
@@ -222,12 +221,12 @@ class AbstractSceneModel(AbstractModel):
         value = numbers(root, self.roots[root])[name]
         return jnp.zeros(()) if value is None else value
 
-    def replaced(self, values: dict[str, Any], were_checked: bool = False) -> Self:
-        own = {name: as_number(value) for name, value in values.items() if not name.startswith("event.")}
+    def replaced(self, values: dict[str, Any]) -> Self:
+        own = {name: value for name, value in values.items() if not name.startswith("event.")}
         event = self.event
         if event is not None:
             event = dataclasses.replace(event, parameters=event.parameters.replaced(values))
-        return dataclasses.replace(self, **with_numbers(self.roots, own, were_checked), event=event)
+        return dataclasses.replace(self, **with_numbers(self.roots, own), event=event)
 
 
 @functools.singledispatch

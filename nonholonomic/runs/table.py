@@ -154,7 +154,7 @@ class TableJob(NamedTuple):
     def _of_legal(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run, which are legal."""
         size = next((len(values) for values in columns.values()), 1)
-        cells = self.model.replaced(columns, were_checked=True)
+        cells = self.model.replaced(columns)
         sampled: dict[str, Any] = {}
         if self.samples is not None:
             status, sampled = solve_samples(cells, self.samples, self.t1, size, count, self.settings)
@@ -258,10 +258,10 @@ def _with_tangents(
     """The runs of all cells, the tangents along the named parameters, and the scale of each tangent."""
 
     def build(*moving: Array) -> Ensemble:
-        cells = model.replaced(columns | dict(zip(names, moving, strict=True)), were_checked=True)
+        cells = model.replaced(columns | dict(zip(names, moving, strict=True)))
         return Ensemble.of(cells, size, tolerance, continues)
 
-    cells = model.replaced(columns, were_checked=True)
+    cells = model.replaced(columns)
     point = tuple(jnp.asarray(cells.value(name), float) for name in names)
     scales = [tangent_scale(value) for value in point]
     tangents = [

@@ -97,7 +97,7 @@ class OwnModel(AbstractModel):
     def value(self, name: str) -> Array:
         return self.parameters.value(name)
 
-    def replaced(self, values: Mapping[str, ArrayLike], were_checked: bool = False) -> "OwnModel":
+    def replaced(self, values: Mapping[str, ArrayLike]) -> "OwnModel":
         new_values = {name: jnp.asarray(value, float) for name, value in values.items()}
         return dataclasses.replace(self, parameters=self.parameters.replaced(new_values))
 
