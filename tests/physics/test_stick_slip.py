@@ -185,8 +185,11 @@ def test_slips_that_barely_leave_the_friction_cone():
     assert run.status == "completed"
     assert run.stats["sticks"] > 3
     assert run.stats["energy_residual"] < 1e-9 * float(run.energy[0])
-    finer = tippe.simulate(scene_of(top, 0.05), launch, 1.15, tolerance=1e-10)
-    assert_close(run.axis[-1], finer.axis[-1], atol=1e-6)
+    # Two programs may judge by other round-off whether a slip is over.
+    for tolerance in (1e-10, 9e-11, 8e-11, 7e-11):
+        finer = tippe.simulate(scene_of(top, 0.05), launch, 1.15, tolerance=tolerance)
+        assert finer.status == "completed", tolerance
+        assert_close(run.axis[-1], finer.axis[-1], atol=1e-6)
 
 
 @pytest.mark.slow

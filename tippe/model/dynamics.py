@@ -249,6 +249,10 @@ class AbstractRollingDynamics(AbstractContactDynamics):
         and the vector r from there to the contact."""
 
     @abc.abstractmethod
+    def momentum(self, state: States, w: Vector) -> Vector:
+        """The angular momentum J w about the centre of mass, in the moving frame."""
+
+    @abc.abstractmethod
     def with_unit_axes(self, state: States) -> States:
         """The state with the body's axes at unit length, and at right angles."""
 
@@ -260,7 +264,7 @@ class AbstractRollingDynamics(AbstractContactDynamics):
         """The state after an impulse at the contact that gives the contact point the given velocity along the arena.
 
         The angular momentum about the contact, K = L - m r x u, does not change in the impulse: w solves (J + m (r^2 -
-        r r^T)) w = K + m r x v, u = r x w + v, and L = K + m r x u. Jellett's quantity is constant, and an impulse that
+        r r^T)) w = K + m r x v, u = r x w + v, and L = J w. Jellett's quantity is constant, and an impulse that
         stops the slip dissipates the energy of v in the metric of the contact's inertia.
 
         **Arguments:**
@@ -273,8 +277,9 @@ class AbstractRollingDynamics(AbstractContactDynamics):
         (w, r), (u, e, L, place) = self.rotation(state), parts(state)
         m, v, swing = self.body.mass, (slip.x, slip.y, None), cross(r, w)
         about_contact = sum_vectors(L, scale(-m, cross(r, (*u, swing[2]))))
-        u = sum_vectors(cross(r, self.over_inertia(state, r, sum_vectors(about_contact, scale(m, cross(r, v))))), v)
-        return joined(u[:2], e, sum_vectors(about_contact, scale(m, cross(r, u))), place)
+        w = self.over_inertia(state, r, sum_vectors(about_contact, scale(m, cross(r, v))))
+        # K + m r x u would be the same, but the rounding errors of w would be left in the slip.
+        return joined(sum_vectors(cross(r, w), v)[:2], e, self.momentum(state, w), place)
 
     def unit_impulse(self, state: States, axis: int) -> tuple[Component, ...]:
         """The impulse at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena
@@ -473,6 +478,10 @@ class RollingDynamics(AbstractRollingDynamics):
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
         slip = Slip(zero, zero, (w[0], w[1], None))
         return Motion(rate, F[2], load, slip, V, o, dot(L, e), 1.0 + zero, room), F
+
+    def momentum(self, state: States, w: Vector) -> Vector:
+        e = parts(state).axis
+        return sum_vectors(scale(self.body.I1, w), scale((self.body.I3 - self.body.I1) * dot(w, e), e))
 
     def with_unit_axes(self, state: States) -> States:
         axis = state[AXIS]

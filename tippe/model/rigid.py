@@ -667,6 +667,10 @@ class RigidRolling(AbstractRigidDynamics, AbstractRollingDynamics):
         solution = self._about_contact(to_frame(lever, axes)).solve(to_frame(torque, axes))
         return from_frame(solution, axes)
 
+    def momentum(self, state: States, w: Vector) -> Vector:
+        axes = self.attitude(state).axes
+        return from_frame(self.body.inertia.tensor.times(to_frame(w, axes)), axes)
+
     def with_unit_axes(self, state: States) -> States:
         e, x = state[AXIS] / jnp.linalg.norm(state[AXIS], axis=0), state[-3:]
         x = x - jnp.sum(e * x, axis=0) * e
