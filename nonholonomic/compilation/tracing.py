@@ -1,7 +1,6 @@
 """Read traced functions: on which arguments they depend, of which operations they consist, when they jump, and their bounds."""
 
 import contextlib
-import copy
 import functools
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -140,7 +139,11 @@ class TracedFunction:
 
     def __reduce__(self) -> tuple[Function, tuple[Function]]:
         # A program cannot be pickled, but the function may be.
-        return copy.copy, (self.function,)
+        return _itself, (self.function,)
+
+
+def _itself(function: Function) -> Function:
+    return function
 
 
 def _comparable(value: object) -> Hashable:

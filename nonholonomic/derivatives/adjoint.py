@@ -624,8 +624,8 @@ def _slopes_by_adjoint(
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
     shares = shares_of(len(tangents)).tolist()
-    mixture = jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
-    ended, (by_start, by_number) = solve_with_adjoint(problem, mixture, ends_on_event, options, StepRecorder())
+    probe = jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
+    ended, (by_start, by_number) = solve_with_adjoint(problem, probe, ends_on_event, options, StepRecorder())
 
     def slope(direction: Tangent) -> Float[Array, " cells"]:
         start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]

@@ -127,9 +127,9 @@ class AbstractFrame(eqx.Module):
         """Height [m] of the centre above the lowest point of the surface, or above z = 0 if there is no lowest
         point."""
 
-    @abc.abstractmethod
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
-        """Rate of change of `cyclic`."""
+        """Rate of change of `cyclic`: by default, of the last coordinates of a plane."""
+        return velocity[2 - len(cyclic) :]
 
     @abc.abstractmethod
     def pose(self, place: Place, cyclic: Place) -> Pose:
@@ -168,14 +168,11 @@ class PlaneFrame(AbstractFrame):
     def height(self, place: Place) -> Component:
         return self.distance if self.slope is None else self.slope[0] * place[0] + self.slope[1] * self.distance
 
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
-        return velocity[2 - len(cyclic) :]
-
     def pose(self, place: Place, cyclic: Place) -> Pose:
         x, y = (*place, *cyclic)
-        zero, one = jnp.zeros_like(y), jnp.ones_like(y)
-        sine, cosine = (zero, one) if self.slope is None else (one * self.slope[0], one * self.slope[1])
-        axes = (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
+        zero, unity = jnp.zeros_like(y), jnp.ones_like(y)
+        sine, cosine = (zero, unity) if self.slope is None else (unity * self.slope[0], unity * self.slope[1])
+        axes = (cosine, zero, sine), (zero, unity, zero), (-sine, zero, cosine)
         t1, t2, normal = axes
         position = sum_vectors(scale(x, t1), scale(y, t2), scale(self.distance, normal))
         return Pose(axes, position, zero)
@@ -358,8 +355,9 @@ class CarriedFrame(AbstractFrame):
     def height(self, place: Place) -> Component:
         return self.surface.elevation(place[:3]) + self.distance * dot(self.normal(place[:3]), self.up)
 
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, frame_rate: Tangent) -> Place:
-        return ()
+    def vertical(self, place: Place) -> Vector:
+        # Without the curvature, which the motion of the frame needs.
+        return tuple(dot(axis, self.up) for axis in self.own_axes(place))
 
     def pose(self, place: Place, cyclic: Place) -> Pose:
         """Where the frame is; the angle is eta in the surface's convention, or the slope of the ground if no coordinate of

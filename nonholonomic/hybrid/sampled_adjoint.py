@@ -310,7 +310,7 @@ def hybrid_samples_pulled_back(
         by_end = jnp.where(kept.status == REACHED_END, 0.0, end_time)
         costate = costate._replace(start_time=jnp.where(ends, by_end, costate.start_time))
         for group in groups:
-            active = running & functools.reduce(jnp.logical_or, (kept.before.mode == number for number in group))
+            active = running & functools.reduce(jnp.logical_or, (kept.before.mode == mode for mode in group))
             stage = _Stage(variational, group, kept, output, active & (owner == number), (times, t1), settings, shown)
             lost = active & (kept.ended.status == LEFT_DOMAIN)
             for mask, step in ((lost, stage.through_reset), (active, stage.through_motion)):

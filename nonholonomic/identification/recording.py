@@ -409,9 +409,9 @@ class TextTable(NamedTuple):
     def parts(self, name: str, error: Columns = None) -> tuple[Any, float]:
         """The header of a column (or, for an error, possibly a number), and the factor that converts the file's numbers to
         SI units. **Arguments:** as for `numbers`."""
-        argument, given = ("columns", self.columns[name]) if error is None else ("error", error[name])
+        argument, column = ("columns", self.columns[name]) if error is None else ("error", error[name])
         si, of_header = self.units[name], None
-        first, unit = given if isinstance(given, tuple | list) and len(given) == 2 else (given, None)
+        first, unit = column if isinstance(column, tuple | list) and len(column) == 2 else (column, None)
         if isinstance(first, str):
             matches = [first] if first in self.cells else [full for full in self.cells if _split(full)[0] == first]
             if len(matches) > 1 or not set(self.repeated).isdisjoint(matches):
@@ -437,7 +437,7 @@ class TextTable(NamedTuple):
                 expected = (
                     f"(header, unit), such as ({first!r}, {known!r}), because the header has no unit that is known"
                 )
-            raise ValueError(f"{argument}: {name!r} = {shown(given)} must be {expected}")
+            raise ValueError(f"{argument}: {name!r} = {shown(column)} must be {expected}")
         if not isinstance(unit, str):
             require(unit, f"unit of {name}")
             return first, float(unit)
@@ -446,7 +446,7 @@ class TextTable(NamedTuple):
             raise ValueError(f"unit of {name} = {shown(unit)} must be one of {', '.join(factors)}, or a number of {si}")
         if of_header is not None and SYNONYMS.get(of_header, of_header) != plain:
             raise ValueError(
-                f"{argument}: {name!r} = {shown(given)} contradicts the header {first!r}, whose unit is {of_header}, "
+                f"{argument}: {name!r} = {shown(column)} contradicts the header {first!r}, whose unit is {of_header}, "
                 f"not {unit}: pass the header alone, {name!r}: {first!r}; if the header is wrong, correct it or pass a "
                 f"factor, the number of {si} in {unit}"
             )

@@ -35,7 +35,7 @@ class TableForm(NamedTuple):
     - `nan_if_failed`: whether the time of a run without a result is NaN; otherwise it is infinite.
     """
 
-    named: dict[Status, Status] = {}  # noqa: RUF012
+    named: dict[Status, Status] | None = None
     event: str = "event"
     nan_if_failed: bool = True
     time: str = "time"
@@ -45,7 +45,8 @@ class TableForm(NamedTuple):
     @property
     def codes(self) -> np.ndarray:
         """The integer in a table for each integer of `Status` from 0 on."""
-        return np.array([self.named.get(status, status) for status in sorted(Status)[1:]], np.int8)
+        named = self.named or {}
+        return np.array([named.get(status, status) for status in sorted(Status)[1:]], np.int8)
 
 
 class TableJob(NamedTuple):

@@ -387,8 +387,8 @@ def _no_multipliers(candidates: Candidates, task: Task) -> Multipliers:
     """Multipliers of zero for all constraints."""
     lanes, rows, width = candidates.unknowns.shape
     window, intervals = jnp.zeros((ORDER, width)), rows - ORDER + 1
-    one = eqx.filter_eval_shape(interval_residuals, window, task, jnp.asarray(0), intervals, task.haste)
-    equalities, inequalities, _ = (jnp.zeros((lanes, intervals, *part.shape)) for part in one)
+    of_interval = eqx.filter_eval_shape(interval_residuals, window, task, jnp.asarray(0), intervals, task.haste)
+    equalities, inequalities, _ = (jnp.zeros((lanes, intervals, *part.shape)) for part in of_interval)
     return equalities, inequalities
 
 
