@@ -55,7 +55,7 @@ def test_all_tables_use_words_of_the_list():
     assert tuple(Status(code).word for code in range(len(WORDS))) == WORDS
     kept = {status: status for status in Status if status is not Status.PENDING}
     for form in (TableForm(), FORM, INVERSIONS, REVERSALS):
-        assert {Status(k): Status(code) for k, code in enumerate(form.codes)} == kept | form.named
+        assert {Status(k): Status(code) for k, code in enumerate(form.codes)} == kept | (form.named or {})
     assert INVERSIONS.named == {Status.EVENT: Status.INVERTED, Status.COMPLETED: Status.NOT_INVERTED}
     assert REVERSALS.named == {Status.EVENT: Status.REVERSED, Status.COMPLETED: Status.NOT_REVERSED}
     assert FORM.named == {Status.EVENT: Status.CONTACT_LOST}
