@@ -57,6 +57,9 @@ Element = Any
 Elements = np.ndarray
 
 
+#: Elements, or an array of JAX with one more axis, of lanes.
+Movable = Any
+
 #: For each factor of a product, some of its axes.
 Axes = tuple[Sequence[int], Sequence[int]]
 
@@ -122,12 +125,9 @@ class AbstractScalarReader(abc.ABC):
         """The elements of an array that is known."""
 
     @abc.abstractmethod
-    def kind(self, equation: Equation) -> str:
-        """The name of an operation that acts element by element. Raises an error for other operations."""
-
-    @abc.abstractmethod
     def element(self, name: str, *numbers: Element, equation: Equation | None = None) -> Element:
-        """The result of an operation, of this name, on single elements; some operations have parameters in `equation`."""
+        """The result of an operation, of this name, on single elements; `equation` has the parameters of all but sums and
+        products. Raises an error for an operation that does not act element by element."""
 
     def read(self, program: Program, arguments: Sequence[Elements]) -> list[Elements]:
         """The results of a program."""
@@ -141,9 +141,13 @@ class AbstractScalarReader(abc.ABC):
             results[index] = self.element(name, *(value[index] for value in broadcast), equation=equation)
         return results
 
-    def apply(self, equation: Equation, inputs: list[Elements]) -> Sequence[Elements]:
-        """The results of an equation."""
+    def apply(self, equation: Equation, inputs: list[Elements]) -> Sequence[Elements] | Program:
+        """The results of an equation, or the program that it calls."""
         name, params = equation.primitive.name, equation.params
+        if name == "optimization_barrier":
+            return inputs
+        if name in ("jit", "pjit"):
+            return params["jaxpr"]
         if name in MOVES:
             return [MOVES[name](equation, *inputs)]
         if name == "iota":
@@ -155,8 +159,9 @@ class AbstractScalarReader(abc.ABC):
         if name in REDUCTIONS:
             return [self.reduced(REDUCTIONS[name], inputs[0], params["axes"])]
         if name == "dot_general":
-            return [self._product(inputs[0], inputs[1], *params["dimension_numbers"])]
-        return [self.each(self.kind(equation), *inputs, equation=equation)]
+            left, right, summed = factors(inputs[0], inputs[1], params["dimension_numbers"])
+            return [self.reduced("add", self.each("mul", left, right), summed)]
+        return [self.each(name, *inputs, equation=equation)]
 
     def reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
         """Combine the elements along some axes, one by one."""
@@ -165,18 +170,6 @@ class AbstractScalarReader(abc.ABC):
             return self.constants(np.full(kept, {"mul": 1.0, "and": True, "or": False}.get(name, 0.0)))
         rows = np.moveaxis(elements, axes, range(-len(axes), 0)).reshape(*kept, -1)
         return functools.reduce(functools.partial(self.each, name), rows_along(rows, -1))
-
-    def _product(self, left: Elements, right: Elements, contracted: Axes, batches: Axes) -> Elements:
-        """The sum over the contracted axes; batch axes come first, then those of the left and those of the right."""
-
-        def factor(value: Elements, summed: Sequence[int], batch: Sequence[int]) -> tuple[Elements, list[list[int]]]:
-            free = [k for k in range(value.ndim) if k not in (*summed, *batch)]
-            shape = [[value.shape[k] for k in axes] for axes in (batch, free, summed)]
-            return np.transpose(value, [*batch, *free, *summed]).reshape([math.prod(part) for part in shape]), shape
-
-        (left, (common, rows, _)), (right, (_, columns, _)) = map(factor, (left, right), contracted, batches)
-        products = self.each("mul", left[:, :, None], right[:, None])
-        return self.reduced("add", products, [3]).reshape([*common, *rows, *columns])
 
 
 def rows_along(elements: Elements, axis: int) -> list[Elements]:
@@ -205,18 +198,9 @@ class Evaluation(AbstractScalarReader):
             elements[index] = constants[index]
         return elements
 
-    def apply(self, equation: Equation, inputs: list[Elements]) -> Sequence[Elements]:
-        name = equation.primitive.name
-        if name in ("jit", "pjit"):
-            return self.read(equation.params["jaxpr"], inputs)
-        return inputs if name == "optimization_barrier" else super().apply(equation, inputs)
-
-    def kind(self, equation: Equation) -> str:
-        if equation.primitive.name not in BY_ELEMENT.split():
-            raise TooLarge(equation.primitive.name)
-        return equation.primitive.name
-
     def element(self, name: str, *numbers: Element, equation: Equation | None = None) -> Element:
+        if name not in BY_ELEMENT.split():
+            raise TooLarge(name)
         simplified = _simplified(name, numbers)
         if simplified is not None:
             if name == "mul" and _is_constant(simplified):
@@ -316,12 +300,12 @@ REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "r
 REDUCTIONS |= {"reduce_and": "and", "reduce_or": "or"}
 
 
-def _broadcast(equation: Equation, elements: Elements) -> Elements:
+def _broadcast(equation: Equation, elements: Movable) -> Movable:
     shape, places = equation.params["shape"], equation.params["broadcast_dimensions"]
-    inner = [1] * len(shape)
+    inner, own = [1] * len(shape), elements.shape[len(places) :]
     for axis, place in enumerate(places):
         inner[place] = elements.shape[axis]
-    return np.broadcast_to(elements.reshape(inner), shape)
+    return elements.__array_namespace__().broadcast_to(elements.reshape((*inner, *own)), (*shape, *own))
 
 
 def _padded(equation: Equation, elements: Elements, filling: Elements) -> Elements:
@@ -338,18 +322,29 @@ def _padded(equation: Equation, elements: Elements, filling: Elements) -> Elemen
     return result
 
 
-def _sliced(equation: Equation, elements: Elements) -> Elements:
+def _sliced(equation: Equation, elements: Movable) -> Movable:
     params = equation.params
-    steps = params["strides"] or (1,) * elements.ndim
+    steps = params["strides"] or (1,) * len(params["start_indices"])
     return elements[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
 
 
-def _reshaped(equation: Equation, elements: Elements) -> Elements:
-    return elements.reshape(equation.outvars[0].aval.shape)
+def _reshaped(equation: Equation, elements: Movable) -> Movable:
+    own = elements.shape[len(equation.invars[0].aval.shape) :]
+    return elements.reshape((*equation.outvars[0].aval.shape, *own))
 
 
-#: Operations that move numbers.
-MOVES: dict[str, Callable[..., Elements]] = {
+def _transposed(equation: Equation, elements: Movable) -> Movable:
+    order = equation.params["permutation"]
+    return elements.transpose((*order, *range(len(order), elements.ndim)))
+
+
+def _tiled(equation: Equation, elements: Movable) -> Movable:
+    counts = equation.params["reps"]
+    return elements.__array_namespace__().tile(elements, (*counts, *[1] * (elements.ndim - len(counts))))
+
+
+#: Operations that move numbers, for arrays that may have one more axis, of lanes, at the end; `pad` for elements only.
+MOVES: dict[str, Callable[..., Any]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda equation, *parts: np.concatenate(parts, axis=equation.params["dimension"]),
     "expand_dims": _reshaped,
@@ -359,8 +354,8 @@ MOVES: dict[str, Callable[..., Elements]] = {
     "slice": _sliced,
     "squeeze": _reshaped,
     "stack": lambda equation, *parts: np.stack(parts, axis=equation.params["axis"]),
-    "tile": lambda equation, elements: np.tile(elements, equation.params["reps"]),
-    "transpose": lambda equation, elements: np.transpose(elements, equation.params["permutation"]),
+    "tile": _tiled,
+    "transpose": _transposed,
 }
 
 
@@ -383,32 +378,35 @@ def spelled_out(function: Function) -> Function:
     return evaluated
 
 
-def _spelled_out(equation: Equation, inputs: list[ArrayLike]) -> Sequence[ArrayLike]:
+def _spelled_out(equation: Equation, inputs: list[ArrayLike]) -> Sequence[ArrayLike] | Program:
     name, params = equation.primitive.name, equation.params
     if name in ("jit", "pjit"):
-        return read_program(params["jaxpr"], inputs, _spelled_out)
+        return params["jaxpr"]
     if name == "dot_general":
         (_, right_sums), (_, right_batch) = params["dimension_numbers"]
         left, right = map(jnp.asarray, inputs)
         columns = (size for k, size in enumerate(right.shape) if k not in (*right_sums, *right_batch))
         if left.size * math.prod(columns) <= MOST_TERMS:
-            return [summed_products(left, right, params["dimension_numbers"])]
+            left, right, summed = factors(left, right, params["dimension_numbers"])
+            return [jnp.sum(left * right, axis=summed)]
     return bound(equation, inputs)
 
 
-def summed_products(left: Array, right: Array, dimensions: tuple[Axes, Axes], inner: int = 0) -> Array:
-    """The sum over the contracted axes of two arrays; batch axes come first, then those of the left and those of the right,
-    and then `inner` axes that both arrays have at the end."""
+def factors(
+    left: Movable, right: Movable, dimensions: tuple[Axes, Axes], inner: int = 0
+) -> tuple[Movable, Movable, tuple[int, ...]]:
+    """Two arrays whose product, summed over the returned axes, is their sum over the contracted axes; batch axes come first,
+    then those of the left and those of the right, and then `inner` axes that both arrays have at the end."""
     (sums, right_sums), (batch, right_batch) = dimensions
     free = [k for k in range(left.ndim - inner) if k not in (*sums, *batch)]
     right_free = [k for k in range(right.ndim - inner) if k not in (*right_sums, *right_batch)]
-    left = jnp.transpose(left, (*batch, *free, *sums, *range(left.ndim - inner, left.ndim)))
-    right = jnp.transpose(right, (*right_batch, *right_free, *right_sums, *range(right.ndim - inner, right.ndim)))
+    left = left.transpose((*batch, *free, *sums, *range(left.ndim - inner, left.ndim)))
+    right = right.transpose((*right_batch, *right_free, *right_sums, *range(right.ndim - inner, right.ndim)))
     first, middle = len(batch), len(batch) + len(free)
-    left = left.reshape(*left.shape[:middle], *(1 for _ in right_free), *left.shape[middle:])
-    right = right.reshape(*right.shape[:first], *(1 for _ in free), *right.shape[first:])
+    left = left.reshape((*left.shape[:middle], *(1 for _ in right_free), *left.shape[middle:]))
+    right = right.reshape((*right.shape[:first], *(1 for _ in free), *right.shape[first:]))
     end = middle + len(right_free)
-    return jnp.sum(left * right, axis=tuple(range(end, end + len(sums)))) if sums else left * right
+    return left, right, tuple(range(end, end + len(sums)))
 
 
 # Map a function over the last axis of its arguments, and keep this axis last.
@@ -417,7 +415,7 @@ def summed_products(left: Array, right: Array, dimensions: tuple[Axes, Axes], in
 # compilers vectorise only along the last axis, so this costs up to ten times as much for a function of medium size, such as
 # a network of a thousand weights.
 
-#: Operations whose parameters do not change with an axis at the end.
+#: Operations whose parameters do not change with an axis at the end, besides those that move numbers.
 UNCHANGED = (*REDUCTIONS, "argmax", "argmin", "cumsum", "cumprod", "rev", "squeeze", "concatenate", "split", "stack")
 
 
@@ -448,43 +446,25 @@ def _with_axis(value: ArrayLike, ndim: int, size: int) -> Array:
     return value if value.ndim > ndim else jnp.broadcast_to(value[..., None], (*value.shape, size))
 
 
-def _applied(equation: Equation, operands: list[Array], size: int) -> Sequence[Array]:
+def _applied(equation: Equation, operands: list[Array], size: int) -> Sequence[Array] | Program:
     """The results of an equation, with one more axis where an operand has one more."""
-    own = [atom.aval.ndim for atom in equation.invars]
-    if equation.primitive.name in ("jit", "pjit"):
-        return read_program(equation.params["jaxpr"], operands, functools.partial(_applied, size=size))
+    name, params, own = equation.primitive.name, equation.params, [atom.aval.ndim for atom in equation.invars]
+    if name in ("jit", "pjit"):
+        return params["jaxpr"]
     if not any(jnp.ndim(operand) > ndim for operand, ndim in zip(operands, own, strict=True)):
         return bound(equation, operands)
-    wide = [_with_axis(operand, ndim, size) for operand, ndim in zip(operands, own, strict=True)]
-    results = _mapped(equation, wide, own, size)
-    return results if isinstance(results, list | tuple) else [results]
-
-
-def _mapped(equation: Equation, operands: list[Array], own: list[int], size: int) -> Any:
-    """An operation on operands with one more axis than `own`."""
-    name, params = equation.primitive.name, equation.params
+    operands = [_with_axis(operand, ndim, size) for operand, ndim in zip(operands, own, strict=True)]
     if name in BY_ELEMENT.split():
         # A scalar may meet an array.
         shape = (*equation.outvars[0].aval.shape, size)
-        return equation.primitive.bind(*(jnp.broadcast_to(operand, shape) for operand in operands), **params)
+        return bound(equation, [jnp.broadcast_to(operand, shape) for operand in operands])
     if name in UNCHANGED:
-        return equation.primitive.bind(*operands, **params)
+        return bound(equation, operands)
     if name == "dot_general":
-        return summed_products(operands[0], operands[1], params["dimension_numbers"], inner=1)
-    if name == "broadcast_in_dim":
-        dimensions = (*params["broadcast_dimensions"], len(params["shape"]))
-        return jax.lax.broadcast_in_dim(operands[0], (*params["shape"], size), dimensions)
-    if name in ("reshape", "expand_dims"):
-        return operands[0].reshape(*equation.outvars[0].aval.shape, size)
-    if name == "tile":
-        return jnp.tile(operands[0], (*params["reps"], 1))
-    if name == "transpose":
-        return jnp.transpose(operands[0], (*params["permutation"], own[0]))
-    if name == "slice":
-        limits, strides = (*params["limit_indices"], size), params["strides"]
-        return jax.lax.slice(
-            operands[0], (*params["start_indices"], 0), limits, None if strides is None else (*strides, 1)
-        )
+        left, right, summed = factors(operands[0], operands[1], params["dimension_numbers"], inner=1)
+        return [jnp.sum(left * right, axis=summed)]
+    if name in MOVES and name != "pad":
+        return [MOVES[name](equation, *operands)]
     raise TooLarge(name)
 
 

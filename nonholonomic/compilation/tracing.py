@@ -53,22 +53,12 @@ def is_elementary(function: Function, *args: PyTree) -> bool:
     return operations(program) <= set(ELEMENTARY.split())
 
 
-def depends_on_first(function: Function, first: PyTree, *args: PyTree) -> bool:
-    """Whether a function's results depend on its first argument, a number."""
-    closed = jax.make_jaxpr(function)(first, *args)
-    return any(_reached(closed, [k == 0 for k in range(len(closed.in_avals))]))
-
-
-def dependent_outputs(function: Function, *args: PyTree) -> list[bool]:
-    """A mask of the function's results that depend on its arguments."""
+def dependent_outputs(function: Function, *args: PyTree, on_first_alone: bool = False) -> list[bool]:
+    """A mask of the function's results that depend on its arguments, or on the first one, a number, alone."""
     closed = jax.make_jaxpr(function)(*args)
-    return _reached(closed, [True] * len(closed.in_avals))
-
-
-def _reached(program: Program, inputs: Sequence[bool]) -> list[bool]:
-    """Which results depend on the inputs that are true in a mask."""
+    inputs = [k == 0 or not on_first_alone for k in range(len(closed.in_avals))]
     return read_program(
-        program, inputs, lambda equation, reached: [any(reached)] * len(equation.outvars), lambda _: False
+        closed, inputs, lambda equation, reached: [any(reached)] * len(equation.outvars), lambda _: False
     )
 
 
@@ -290,8 +280,8 @@ class _Reader(NamedTuple):
         """The kinds of the results of a program."""
         return read_program(program, inputs, self.apply, Known)
 
-    def apply(self, equation: Equation, inputs: list[Any]) -> Sequence[Kind]:
-        """The kinds of the results of an equation."""
+    def apply(self, equation: Equation, inputs: list[Any]) -> Sequence[Kind] | Program:
+        """The kinds of the results of an equation, or the program that it calls."""
         name, parameters, count = equation.primitive.name, equation.params, len(equation.outvars)
         values = [kind.value for kind in inputs if isinstance(kind, Known)]
         if len(values) == len(inputs):
@@ -305,11 +295,13 @@ class _Reader(NamedTuple):
             branches = [self.read(branch, inputs[1:]) for branch in parameters["branches"]]
             return [Other(any(map(_depends, (inputs[0], *kinds)))) for kinds in zip(*branches, strict=True)]
         if name in ("while", "scan"):
-            if depends and any(map(_compares, programs_of(equation))):
+            inner_equations = [inner for program in programs_of(equation) for inner in equations_in(program)]
+            comparisons = (inner for inner in inner_equations if inner.primitive.name in COMPARISONS)
+            if depends and any(jnp.issubdtype(inner.invars[0].aval.dtype, jnp.inexact) for inner in comparisons):
                 self.unclear[name] = None
             return [Other(depends)] * count
         if (inner := called_program(equation)) is not None:
-            return self.read(inner, inputs)
+            return inner
         if not depends:
             return [Other(False)] * count
         is_real = jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact)
@@ -387,12 +379,6 @@ def _depends(kind: Kind) -> bool:
     return isinstance(kind, Affine) or (isinstance(kind, Other) and kind.depends_on_time)
 
 
-def _compares(program: Program) -> bool:
-    """Whether a program compares real numbers."""
-    comparisons = (equation for equation in equations_in(program) if equation.primitive.name in COMPARISONS)
-    return any(jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact) for equation in comparisons)
-
-
 # Bounds of a function over boxes of its arguments: interval arithmetic on traced operations.
 #
 # The bounds hold up to round-off. They are those of natural interval extension (Moore, Kearfott and Cloud, Introduction to
@@ -420,7 +406,7 @@ GROWING = """
 """
 
 #: Operations that call another traced function; and operations that jump, from one whole number to another.
-CALLS = "closed_call core_call custom_jvp_call custom_vjp_call jit pjit"
+CALLS = ("closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "jit", "pjit")
 STEPPING = ["ceil", "convert_element_type", "floor", "round", "sign"]
 
 
@@ -468,15 +454,29 @@ def _exactly(number: ArrayLike) -> Bounds:
     return Bounds(jnp.asarray(number), jnp.asarray(number))
 
 
-def _applied(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose: bool) -> list[Bounds]:
-    """The bounds of the results of an operation."""
-    name = equation.primitive.name
-    try:
-        results = _bounded(equation, boxes, leaps, loose)
-    except UnboundedError:
-        if not loose:
-            raise
+def _applied(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose: bool) -> Sequence[Bounds] | Program:
+    """The bounds of the results of an operation, or the program that it calls."""
+    name, same = equation.primitive.name, len(boxes) == 2 and equation.invars[0] is equation.invars[1]
+    if name in CALLS and (program := called_program(equation)) is not None:
+        return program
+    if name == "scan":
+        return _repeated(equation, boxes, leaps, loose)
+    if name in GROWING.split():
+        lows, highs = map(functools.partial(bound, equation), zip(*boxes, strict=True) if boxes else ([], []))
+        results = list(map(Bounds, lows, highs))
+    elif name == "mul" and same:
+        results = [_even(boxes[0], jnp.square)]
+    elif name in COMPARISONS and same:
+        # Asks whether this is a number.
+        results = [_exactly(jnp.full(boxes[0].low.shape, name in ("eq", "ge", "le")))]
+    elif name in RULES and not (name in ("div", "rem") and jnp.issubdtype(boxes[0].low.dtype, jnp.integer)):
+        results = [RULES[name](*boxes)]
+    elif name in RULES_WITH_PARAMETERS and (name != "sort" or len(boxes) == 1):
+        results = [RULES_WITH_PARAMETERS[name](equation, *boxes)]
+    elif loose:
         return [_anything(variable.aval) for variable in equation.outvars]
+    else:
+        raise UnboundedError(name)
     if name == "atan2":
         leaps.append(_contains_zero(boxes[0]) & (boxes[1].low <= 0.0))
     elif name == "rem":
@@ -495,35 +495,6 @@ def _anything(aval: Any) -> Bounds:
         is_truth = jnp.issubdtype(aval.dtype, bool)
         least, most = (False, True) if is_truth else (jnp.iinfo(aval.dtype).min, jnp.iinfo(aval.dtype).max)
     return Bounds(jnp.full(aval.shape, least, aval.dtype), jnp.full(aval.shape, most, aval.dtype))
-
-
-def _bounded(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose: bool) -> list[Bounds]:
-    name, same = equation.primitive.name, len(boxes) == 2 and equation.invars[0] is equation.invars[1]
-    if name in CALLS.split() and (program := called_program(equation)) is not None:
-        return _enclosed(program, boxes, leaps, loose)
-    if name in GROWING.split():
-        lows, highs = (
-            (bound(equation, ends) for ends in zip(*boxes, strict=True)) if boxes else 2 * [bound(equation, [])]
-        )
-        return list(map(Bounds, lows, highs))
-    if name == "mul" and same:
-        return [_even(boxes[0], jnp.square)]
-    if name in COMPARISONS and same:
-        # Asks whether this is a number.
-        return [_exactly(jnp.full(boxes[0].low.shape, name in ("eq", "ge", "le")))]
-    if name == "integer_pow":
-        return [_integer_power(equation.params["y"], *boxes)]
-    if name == "reduce_prod":
-        return [_product_along(equation.params["axes"], *boxes)]
-    if name == "dot_general":
-        return [_contracted(equation, *boxes)]
-    if name == "sort" and len(boxes) == 1:
-        return [Bounds(*(bound(equation, [end])[0] for end in boxes[0]))]
-    if name == "scan":
-        return _repeated(equation, boxes, leaps, loose)
-    if name not in RULES or (name in ("div", "rem") and jnp.issubdtype(boxes[0].low.dtype, jnp.integer)):
-        raise UnboundedError(name)
-    return [RULES[name](*boxes)]
 
 
 def _hull(*corners: Array) -> Bounds:
@@ -554,14 +525,11 @@ def _even(box: Bounds, function: Callable[[Array], Array]) -> Bounds:
     return Bounds(function(nearest), function(jnp.maximum(jnp.abs(box.low), jnp.abs(box.high))))
 
 
-def _integer_power(power: int, box: Bounds) -> Bounds:
-    if power < 0:
-        return _quotient(_exactly(jnp.ones_like(box.low)), _integer_power(-power, box))
-
-    def raised(x: Array) -> Array:
-        return jax.lax.integer_pow(x, power)
-
-    return Bounds(raised(box.low), raised(box.high)) if power % 2 else _even(box, raised)
+def _integer_power(equation: Equation, box: Bounds) -> Bounds:
+    power = equation.params["y"]
+    raised = functools.partial(jax.lax.integer_pow, y=abs(power))
+    result = Bounds(raised(box.low), raised(box.high)) if power % 2 else _even(box, raised)
+    return result if power >= 0 else _quotient(_exactly(jnp.ones_like(box.low)), result)
 
 
 def _power(base: Bounds, exponent: Bounds) -> Bounds:
@@ -614,8 +582,8 @@ def _polynomial(x: Bounds, *coefficients: Bounds) -> Bounds:
     return value
 
 
-def _product_along(axes: tuple[int, ...], box: Bounds) -> Bounds:
-    for axis in sorted(axes, reverse=True):
+def _product_along(equation: Equation, box: Bounds) -> Bounds:
+    for axis in sorted(equation.params["axes"], reverse=True):
         factors = [Bounds(*(jnp.take(end, k, axis) for end in box)) for k in range(box.low.shape[axis])]
         box = functools.reduce(_product, factors)
     return box
@@ -691,4 +659,12 @@ RULES: dict[str, Callable[..., Bounds]] = {
     "square": lambda box: _even(box, jnp.square),
     "sub": lambda a, b: Bounds(a.low - b.high, a.high - b.low),
     "tan": _tangent,
+}
+
+#: The same for operations with parameters, which are those of the equation.
+RULES_WITH_PARAMETERS: dict[str, Callable[..., Bounds]] = {
+    "dot_general": _contracted,
+    "integer_pow": _integer_power,
+    "reduce_prod": _product_along,
+    "sort": lambda equation, box: Bounds(*(bound(equation, [end])[0] for end in box)),
 }

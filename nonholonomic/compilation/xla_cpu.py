@@ -61,7 +61,7 @@ def opened(program: Program) -> tuple[Jaxpr, Sequence[ArrayLike]]:
 def read_program(
     program: Program,
     arguments: Sequence[Value],
-    apply: Callable[[Equation, list[Value]], Sequence[Value]],
+    apply: Callable[[Equation, list[Value]], Sequence[Value] | Program],
     known: Callable[[Any], Value] = lambda value: value,
 ) -> list[Value]:
     """The results of a program, whose equations are applied to values of any kind.
@@ -69,7 +69,8 @@ def read_program(
     **Arguments:**
 
     - `program`, `arguments`: the program, and the values of its arguments.
-    - `apply`: function of an equation and of the values of its operands that returns the values of its results.
+    - `apply`: function of an equation and of the values of its operands that returns the values of its results, or a
+      program to be read for these operands.
     - `known`: converts a constant to a value.
 
     **Example:** count the operations on the way to a result.
@@ -87,7 +88,10 @@ def read_program(
         return known(atom.val) if isinstance(atom, Literal) else values[atom]
 
     for equation in jaxpr.eqns:
-        results = apply(equation, [read(atom) for atom in equation.invars])
+        inputs = [read(atom) for atom in equation.invars]
+        results = apply(equation, inputs)
+        if isinstance(results, Program):
+            results = read_program(results, inputs, apply, known)
         values |= dict(zip(equation.outvars, results, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 

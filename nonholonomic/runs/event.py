@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..compilation.components import over_lanes, spelled_out
-from ..compilation.tracing import depends_on_first, is_elementary, with_own_numbers
+from ..compilation.tracing import dependent_outputs, is_elementary, with_own_numbers
 from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, solve_ensemble_with_tangents, tangents_by
 from ..hybrid import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid, solve_hybrid_with_tangents
 from ..hybrid.saltation import UNMEASURED, Clock
@@ -128,7 +128,7 @@ def with_event(model: AbstractModel, event: Any) -> AbstractModel:
     example = (jnp.zeros(()), jax.tree.map(lambda value: jnp.zeros(value.shape, value.dtype), values))
     function = with_own_numbers(OfValues(event), *example)
     parameters = Parameters.of({"event": function})
-    depends_on_time = depends_on_first(function, *example)
+    depends_on_time = any(dependent_outputs(function, *example, on_first_alone=True))
     model = dataclasses.replace(model, event=EventFunction(parameters, names, depends_on_time, False))
     leaves, structure = jax.tree.flatten(model)
     rows = rows_of(model, names)

@@ -4,8 +4,8 @@ A hybrid system is a `Hybrid` of modes, each an `AbstractMode`; a mechanical sys
 potential, constraints and forces the equations of motion follow.
 """
 
-from .form import AbstractMode as AbstractMode
 from .form import Hybrid as Hybrid
+from .mechanics import AbstractMode as AbstractMode
 from .mechanics import AbstractSystem as AbstractSystem
 from .model import OwnModel as OwnModel
 from .model import page_of_system as page_of_system

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.components import over_lanes
 from ..compilation.tracing import in_cells
@@ -42,62 +42,33 @@ SOON = 4.0 ** -np.arange(10.0, 0.0, -1.0)
 class ModeProblem(AbstractProblem):
     """The motion in one mode, up to the event or the end of the mode.
 
-    `numbers`: the system's numbers; `states`, `scales`: as `start` returns them; `tolerance`: of the modes before;
-    `jump_times`: the readings of the clock in the state at which a function of the mode may jump; `allowances`: for each
-    margin an allowance for errors of the start, zero where the mode does not begin on the margin.
+    `mode`: the mode; `states`: at the start; `jump_times`: the readings of the clock in the state at which a function of the
+    mode may jump; `allowances`: for each margin an allowance for errors of the start, zero where the mode does not begin on
+    the margin.
     """
 
     direction_decides: ClassVar[bool] = True
     fast: ClassVar[tuple[bool, bool]] = True, True
 
-    numbers: tuple[Float[Array, "..."], ...]
+    mode: "BatchedMode"
     states: Float[Array, "components *cells"]
-    scales: Float[Array, "components *cells"]
-    tolerance: Float[Array, ""]
-    form: Form = eqx.field(static=True)
-    mode: int = eqx.field(static=True)
     jump_times: Float[Array, "jumps *cells"] | None = None
     allowances: Float[Array, "margins *cells"] | None = None
 
-    @classmethod
-    def of(
-        cls,
-        numbers: tuple[Float[Array, "..."], ...],
-        states: States,
-        scales: States,
-        tolerance: Float[Array, ""],
-        form: Form,
-        mode: int,
-    ) -> "ModeProblem":
-        """The problem of a mode, with the jumps of its functions and its allowances."""
-        times_of, depends = functools.partial(form.jump_times, mode), form.traits.depends_on_time
-        times = in_cells(times_of, numbers, states.shape[1:]) if depends else None
-        problem = cls(numbers, states, scales, tolerance, form, mode, times)
-        if not form.traits.ends[mode]:
-            return problem
-        value, _, error, _, is_tangential = jax.tree.map(stop_gradient, problem)._at_start()
-        # Where the margin rises with slope 0, errors of the start may let it fall at first.
-        dip = jnp.where(is_tangential, error, ROUND_OFF / tolerance * error)
-        allowances = jnp.where(
-            jnp.abs(value) <= ACCUMULATED * error, dip + 2.0 * jnp.maximum(-value, 0.0) + 1e-200, 0.0
-        )
-        return dataclasses.replace(problem, allowances=stop_gradient(allowances))
-
     @property
     def fits_one_kernel(self) -> bool:
-        return self.form.traits.elementary
+        return self.mode.form.traits.elementary
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.states, self.scales
+        return self.states, self.mode.scales
 
     def field(self, time: Lanes, state: Components) -> States:
-        evaluate = _in_lanes_out_of_line if self.form.traits.large[self.mode] else _in_lanes
-        rates = evaluate(self.form, "field", self.mode, self.numbers, tuple(state))
-        clock = (jnp.ones_like(state[0]),) if self.form.traits.depends_on_time else ()
+        rates = self.mode.in_lanes("field", state)
+        clock = (jnp.ones_like(state[0]),) if self.mode.form.traits.depends_on_time else ()
         return jnp.stack((*rates, *clock))
 
     def event_function(self, state: States) -> Lanes | None:
-        return _in_lanes(self.form, "event", 0, self.numbers, tuple(state)) if self.form.has_event else None
+        return self.mode.in_lanes("event", state) if self.mode.form.has_event else None
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         margins = self.margins(time, state)
@@ -106,44 +77,44 @@ class ModeProblem(AbstractProblem):
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         if self.allowances is None:
             # If some modes have a domain margin, all modes need one.
-            return () if self.form.traits.smooth else (jnp.ones_like(state[0]),)
-        return tuple(margin + extra for margin, extra in zip(self._margins(state), self.allowances, strict=True))
+            return () if self.mode.form.traits.smooth else (jnp.ones_like(state[0]),)
+        return tuple(
+            margin + extra for margin, extra in zip(self.mode.in_lanes("margins", state), self.allowances, strict=True)
+        )
 
     def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
-        return least(*self._margins(state)) if self.form.traits.ends[self.mode] else None
+        return least(*self.mode.in_lanes("margins", state)) if self.mode.margins else None
 
-    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
+    def lostat_start(self, state: States) -> Bool[Array, "..."] | None:
         if self.allowances is None:
             return None
-        value, slope, error, slope_error, is_tangential = self._at_start()
+        value, slope, error, slope_error, is_tangential = self.at_start()
         falls = jax.lax.cond(
             jnp.any(is_tangential),
             lambda: self._falls_soon(value, error + 2.0 * jnp.abs(value), error / slope_error),
             lambda: jnp.zeros(value.shape, bool),
         )
         is_near = jnp.abs(value) <= ACCUMULATED * error
-        falls = jnp.where(is_tangential, falls, slope < 0.0) & (value <= ROUND_OFF / self.tolerance * error)
+        falls = jnp.where(is_tangential, falls, slope < 0.0) & (value <= ROUND_OFF / self.mode.tolerance * error)
         return jnp.any(jnp.where(is_near, falls, value <= 0.0), axis=0)
 
-    def _margins(self, state: States) -> tuple[Lanes, ...]:
-        """The margins without allowances."""
-        return _in_lanes(self.form, "margins", self.mode, self.numbers, tuple(state))
-
-    def _at_start(self) -> tuple[Array, ...]:
+    def at_start(self) -> tuple[Array, ...]:
         """The margins at the start; their slopes along the motion; the errors of both if the error of every component is the
         tolerance, and whether value and slope are such errors."""
 
         def value_and_slope(state: States) -> tuple[Array, Array]:
             rates = self.field(jnp.zeros_like(state[0]), state)
-            return jax.jvp(lambda point: jnp.stack(self._margins(point)), (state,), (rates,))
+            return jax.jvp(lambda point: jnp.stack(self.mode.in_lanes("margins", point)), (state,), (rates,))
 
         state = self.states
         # The states at the samples of one cell have the scales of the cell.
-        scales = self.scales.reshape(*self.scales.shape, *[1] * (state.ndim - self.scales.ndim))
+        scales = self.mode.scales.reshape(*self.mode.scales.shape, *[1] * (state.ndim - self.mode.scales.ndim))
         sizes = jnp.abs(state) + jnp.where(scales < UNMEASURED, 0.1 * scales, 0.0)
         directions = jnp.eye(len(state)).reshape(*2 * state.shape[:1], *[1] * (state.ndim - 1)) * sizes
         (value, slope), pushed = jax.linearize(value_and_slope, state)
-        error, slope_error = (self.tolerance * jnp.sum(jnp.abs(part), axis=0) for part in jax.vmap(pushed)(directions))
+        error, slope_error = (
+            self.mode.tolerance * jnp.sum(jnp.abs(part), axis=0) for part in jax.vmap(pushed)(directions)
+        )
         is_near = jnp.abs(value) <= ACCUMULATED * error
         return value, slope, error, slope_error, is_near & (jnp.abs(slope) <= ACCUMULATED * slope_error)
 
@@ -164,7 +135,7 @@ class ModeProblem(AbstractProblem):
             # The classical method of Runge and Kutta.
             weights = (jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6.0)
             (_, mean), _ = jax.lax.scan(stage, (rates, jnp.zeros_like(rates)), weights)
-            return jnp.stack(self._margins(state + share * length * mean)) - value
+            return jnp.stack(self.mode.in_lanes("margins", state + share * length * mean)) - value
 
         changes = jax.vmap(change)(jnp.asarray(SOON))
         first = jnp.argmax(jnp.abs(changes) > error, axis=0)
@@ -198,20 +169,44 @@ _in_lanes_out_of_line = jax.jit(_in_lanes, static_argnums=(0, 1, 2))
 
 
 class BatchedMode(AbstractBatchedMode):
-    """A user's mode as a mode of the engine, for cells with `numbers` and `scales` as in `ModeProblem`.
+    """A user's mode as a mode of the engine.
 
-    `tolerance`: of the integration; `continues`: whether a run continues through its event.
+    `numbers`: the system's numbers; `scales`: the magnitudes of the states, which scale their errors; `tolerance`: of the
+    integration of the modes before; `continues`: whether a run continues through its event.
     """
 
     numbers: tuple[Float[Array, "..."], ...]
-    scales: Float[Array, "components cells"]
+    scales: Float[Array, "components *cells"]
     tolerance: Float[Array, ""]
     form: Form = eqx.field(static=True)
-    mode: int = eqx.field(static=True)
+    index: int = eqx.field(static=True)
     continues: bool = eqx.field(static=True, default=False)
 
-    def problem(self, state: Float[Array, "components cells"]) -> ModeProblem:
-        return ModeProblem.of(self.numbers, state, self.scales, self.tolerance, self.form, self.mode)
+    @property
+    def margins(self) -> int:
+        """The number of margins."""
+        return self.form.traits.ends[self.index]
+
+    def in_lanes(self, name: str, state: Components) -> PyTree:
+        """A function of the mode (`Form.function`) in every lane."""
+        is_large = name == "field" and self.form.traits.large[self.index]
+        evaluate = _in_lanes_out_of_line if is_large else _in_lanes
+        return evaluate(self.form, name, self.index, self.numbers, tuple(state))
+
+    def problem(self, state: Float[Array, "components *cells"]) -> ModeProblem:
+        """The problem of the mode, with the jumps of its functions and its allowances."""
+        times_of, depends = functools.partial(self.form.jump_times, self.index), self.form.traits.depends_on_time
+        times = in_cells(times_of, self.numbers, state.shape[1:]) if depends else None
+        problem = ModeProblem(self, state, times)
+        if not self.margins:
+            return problem
+        value, _, error, _, is_tangential = jax.tree.map(stop_gradient, problem).at_start()
+        # Where the margin rises with slope 0, errors of the start may let it fall at first.
+        dip = jnp.where(is_tangential, error, ROUND_OFF / self.tolerance * error)
+        allowances = jnp.where(
+            jnp.abs(value) <= ACCUMULATED * error, dip + 2.0 * jnp.maximum(-value, 0.0) + 1e-200, 0.0
+        )
+        return dataclasses.replace(problem, allowances=stop_gradient(allowances))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """The reset, or the end of the run if the mode has no reset.
@@ -225,10 +220,9 @@ class BatchedMode(AbstractBatchedMode):
 
     def _exit(self, state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
         """The index of the margin that ended the mode: the first of those that are least up to round-off and fall."""
-        if self.form.traits.ends[self.mode] < 2:
+        if self.margins < 2:
             return jnp.zeros(state.shape[1], int)
-        problem = ModeProblem(self.numbers, state, self.scales, self.tolerance, self.form, self.mode)
-        value, slope, error, slope_error, _ = jax.tree.map(stop_gradient, problem)._at_start()
+        value, slope, error, slope_error, _ = jax.tree.map(stop_gradient, ModeProblem(self, state)).at_start()
         is_least = value <= jnp.min(value, axis=0) + ROUND_OFF / self.tolerance * error
         falls = is_least & (slope < -ACCUMULATED * slope_error)
         steepest = jnp.argmin(jnp.where(is_least, slope, jnp.inf), axis=0)
@@ -242,10 +236,10 @@ class BatchedMode(AbstractBatchedMode):
         exit: Int[Array, ""],
     ) -> Transition:
         form, zero, now, never = self.form, jnp.zeros((), int), jnp.zeros(()), jnp.asarray(jnp.inf)
-        if not form.traits.resets[self.mode]:
-            return Transition(zero + self.mode, state, now, zero + LEFT_DOMAIN, never, zero[None])
+        if not form.traits.resets[self.index]:
+            return Transition(zero + self.index, state, now, zero + LEFT_DOMAIN, never, zero[None])
         t, y = time_and_state(form, tuple(state))
-        state_after, number = form.function("reset", self.mode)(numbers, t, y, exit)
+        state_after, number = form.function("reset", self.index)(numbers, t, y, exit)
         number = jnp.asarray(number).astype(int)
         for mode, is_projected in enumerate(form.traits.projected):
             if is_projected:
@@ -259,7 +253,7 @@ class BatchedMode(AbstractBatchedMode):
         def value(state: Float[Array, " components"]) -> Float[Array, ""]:
             return form.function("event")(numbers, *time_and_state(form, tuple(state)))
 
-        rate = jnp.concatenate([form.function("field", self.mode)(numbers, t, y), jnp.ones(len(state) - form.size)])
+        rate = jnp.concatenate([form.function("field", self.index)(numbers, t, y), jnp.ones(len(state) - form.size)])
         sizes = jnp.abs(state) + jnp.where(scales < UNMEASURED, scales, 0.0)
         is_zero = jnp.abs(value(state)) <= ROUND_OFF * jnp.sum(jnp.abs(jax.jacfwd(value)(state)) * sizes)
         ends = is_zero & (jax.jvp(value, (state,), (rate,))[1] < 0.0)
@@ -268,7 +262,7 @@ class BatchedMode(AbstractBatchedMode):
         if self.continues:
             return Transition(number, state_after, now, status, jnp.where(crossed, now, never), zero[None] + 1)
         return Transition(
-            mode=jnp.where(ends, self.mode, jnp.where(jumps, form.modes, number)),
+            mode=jnp.where(ends, self.index, jnp.where(jumps, form.modes, number)),
             state=jnp.where(ends, state, state_after),
             elapsed=now,
             status=jnp.where(crossed, CROSSED, status),
@@ -280,54 +274,3 @@ class BatchedMode(AbstractBatchedMode):
 #: The axis of cells in a `Transition`, for `vmap`.
 _AXES: Any = (0, 1, 0, 0, 0, 1, None, None)
 _TRANSITION_AXES = Transition(*_AXES)
-
-
-class Cells(eqx.Module):
-    """Runs of a system: its numbers and the components of the starts, each a scalar or an array with one number per
-    cell."""
-
-    numbers: tuple[Float[Array, "..."], ...]
-    start: tuple[Float[Array, "..."], ...]
-    form: Form = eqx.field(static=True)
-
-    def states(self, cells: int | None) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
-        """States at the start, including the time if a function depends on it, and the magnitudes that scale their
-        errors: the largest component of a start, but at most 1.
-        """
-        shape = () if cells is None else (cells,)
-        states = jnp.stack([jnp.broadcast_to(part, shape) for part in self.start])
-        magnitude = jnp.max(jnp.abs(stop_gradient(states)), axis=0)
-        scales = jnp.broadcast_to(jnp.where(magnitude > 0.0, jnp.minimum(magnitude, 1.0), 1.0), states.shape)
-        if not self.form.traits.depends_on_time:
-            return states, scales
-        clock = jnp.zeros((1, *shape))
-        return jnp.concatenate([states, clock]), jnp.concatenate([scales, clock + UNMEASURED])
-
-    def within_constraints(self, changes: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
-        """Changes of the states at the start, projected onto those that the constraints of the first mode allow."""
-        form = self.form
-        if not form.traits.projected[form.first]:
-            return changes
-        entered = form.function("entered", form.first)
-
-        def of_one(numbers: Sequence[Array], state: Array, change: Array) -> Array:
-            t, y = time_and_state(form, tuple(state))
-            _, allowed = jax.jvp(lambda y: entered(numbers, t, y), (y,), (change[: form.size],))
-            return jnp.concatenate([allowed, change[form.size :]])
-
-        axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
-        states, _ = self.states(changes.shape[1])
-        return jax.vmap(of_one, in_axes=(axes, 1, 1), out_axes=1)(self.numbers, states, changes)
-
-    def problem(self, cells: int | None) -> ModeProblem:
-        """The problem of a system whose runs are smooth, which starts without an error."""
-        return ModeProblem.of(self.numbers, *self.states(cells), jnp.asarray(ROUND_OFF), self.form, self.form.first)
-
-    def modes(
-        self, cells: int, tolerance: ArrayLike, continues: bool = False
-    ) -> tuple[tuple[BatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
-        """The modes of a system with resets, the index of the first mode, and the initial states in it."""
-        states, scales = self.states(cells)
-        shared = (self.numbers, scales, stop_gradient(jnp.asarray(tolerance, float)), self.form)
-        phases = tuple(BatchedMode(*shared, mode, continues) for mode in range(self.form.modes))
-        return phases, jnp.full(cells, self.form.first), states

@@ -1,7 +1,6 @@
 """What a user writes: modes and mechanical systems in a hybrid system; its form without its numbers, for which JAX compiles a
 program; and what is checked before anything compiles."""
 
-import abc
 import dataclasses
 import difflib
 import functools
@@ -9,7 +8,7 @@ import inspect
 import itertools
 from collections.abc import Callable, Sequence
 from types import CodeType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,106 +17,17 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..compilation.components import spelled_out
-from ..compilation.tracing import depends_on_first, is_elementary, jumps_of, named_errors, warn_of_unclear
+from ..compilation.tracing import dependent_outputs, is_elementary, jumps_of, named_errors, warn_of_unclear
 from ..compilation.xla_cpu import Function, equations_in, traced
 from ..parameters import TreeForm
 from ..text import described, shown
 from ..validation import as_number, require, warn
-from .mechanics import AbstractFormulation, AbstractSystem, Lagrange, within_constraints
+from .mechanics import AbstractFormulation, AbstractMode, AbstractSystem, Lagrange, State, components_of, exit_of
 
 # A hybrid system: smooth modes with resets between them, as functions of one state.
 
-State = Float[Array, " components"]
-
 #: The event function, of time [s] and state; the event happens when it falls through zero.
 Event = Callable[[Float[Array, ""], State], Float[Array, ""]]
-
-#: What the `margin` of a mode returns, and its `reset`.
-Margin = Float[Array, "..."] | dict[str, Float[Array, ""]] | None
-Reset = tuple[State, Any] | None
-
-
-def exit_of(margin: Any, number: ArrayLike) -> tuple[Any, ...]:
-    """The further argument of a reset after the margin of this index has fallen, if there are several: the index, or for a
-    dict whether it is the margin of each name."""
-    if isinstance(margin, dict):
-        return ({name: jnp.asarray(number) == k for k, name in enumerate(margin)},)
-    return () if jnp.ndim(margin) == 0 else (jnp.asarray(number),)
-
-
-class AbstractMode(eqx.Module):
-    """A mode of a hybrid system: its equations of motion, its end, and the next mode. Subclass it, declare the
-    parameters of your model as attributes, and write functions of a single time and a single state with `jax.numpy`.
-    A class attribute such as `names = ("height", "velocity")` names the components of the state.
-    You can sweep, fit and differentiate every attribute that is a float or an array. A mode that never ends needs only
-    the method `field`.
-
-    **Example:** a ball that falls and bounces.
-
-    ```
-    >>> import jax.numpy as jnp
-    >>> import nonholonomic
-    >>> class Ball(nonholonomic.AbstractMode):
-    ...     gravity: float = 9.81
-    ...     restitution: float = 0.8
-    ...
-    ...     def field(self, t, y):
-    ...         return jnp.array([y[1], -self.gravity])
-    ...
-    ...     def margin(self, t, y):
-    ...         return y[0]
-    ...
-    ...     def reset(self, t, y):
-    ...         return jnp.array([0.0, -self.restitution * y[1]]), 0
-    >>> ball = nonholonomic.Hybrid([Ball()], event=lambda t, y: y[1])
-    >>> time = nonholonomic.event_time(ball, jnp.array([1.0, 0.0]), t1=5.0)
-    >>> print(f"highest again after {time:.4f} s")
-    highest again after 0.8127 s
-
-    ```
-    """
-
-    #: Names of the components of the state, such as ("height", "velocity"), in tables and pictures; by default "y0", "y1"
-    #: and so on. One mode of a `Hybrid` is enough.
-    names: ClassVar[tuple[str, ...] | None] = None
-
-    @abc.abstractmethod
-    def field(self, t: Float[Array, ""], y: State) -> State:
-        """Rate of change of the state.
-
-        **Arguments:** `t`: time [s]; `y`: state, (components,).
-
-        **Returns:** the rate, (components,).
-        """
-
-    def margin(self, t: Float[Array, ""], y: State) -> Margin:
-        """A smooth function that is positive while the mode holds and falls through zero where it ends; or several such
-        functions, of which the first to fall ends the mode.
-
-        The function may change faster than the motion, as the height above a vibrating table or above waves: no zero is
-        missed, unless the function contains an operation without bounds, such as a loop.
-
-        **Arguments:** as for `field`.
-
-        **Returns:** a number; several in an array, (k,), or in a dict by name; or `None`, the default, for a mode that never
-        ends.
-        """
-        return None
-
-    def reset(self, t: Float[Array, ""], y: State) -> Reset:
-        """The state and mode that follow when the margin has fallen to zero.
-
-        The margin of the next state may be zero if it then rises, as for a ball that has just bounced.
-
-        **Arguments:** as for `field`, at the end of the mode. If there are several margins, write `reset(self, t, y, exit)`:
-        `exit` is the index of the margin that fell in the array, a traced whole number, or for a dict a dict that is true for
-        the name of the margin that fell and false for the others. Of margins that fall at the same time, the first one counts,
-        and the others follow at once.
-
-        **Returns:** the next state, (components,), and the index of the next mode in `Hybrid.modes`, a whole number
-        that may depend on the state; or `None`, the default, if the run ends here.
-        """
-        return None
 
 
 def require_event(event: object) -> None:
@@ -179,60 +89,6 @@ class Hybrid(eqx.Module):
             )
 
 
-# Mechanical systems as modes.
-
-
-class MechanicalMode(AbstractMode):
-    """The motion of a mechanical system, in the state of one of its formulations, as mode `number` of a hybrid system."""
-
-    formulation: AbstractFormulation
-    number: int = eqx.field(static=True, default=0)
-
-    def field(self, t: Float[Array, ""], y: State) -> State:
-        return self.formulation.field(t, y)
-
-    def margin(self, t: Float[Array, ""], y: State) -> Margin:
-        return self.formulation.system.margin(t, *self.formulation.split(y))
-
-    def reset(self, t: Float[Array, ""], y: State, *exit: Any) -> Reset:
-        system: Any = self.formulation.system
-        following = system.reset(t, *self.formulation.split(y), *exit)
-        if following is None:
-            return None
-        q, rate, *number = following
-        return self.formulation.state(q, rate), number[0] if number else self.number
-
-    @property
-    def is_projected(self) -> bool:
-        """Whether a state may violate the constraints, so that `entered` projects it."""
-        system = self.formulation.system
-        return isinstance(self.formulation, Lagrange) and system.freedom < system.dimension
-
-    def entered(self, t: Float[Array, ""], y: State) -> State:
-        """The state after a reset to this mode, with rates that obey the constraints."""
-        q, rate = self.formulation.split(y)
-        return self.formulation.state(q, within_constraints(self.formulation.system, q, rate))
-
-
-class MechanicalEvent(eqx.Module):
-    """An event of a mechanical system, as a function of the formulation's state."""
-
-    formulation: AbstractFormulation
-    event: Event
-
-    def __call__(self, t: Float[Array, ""], y: State) -> Float[Array, ""]:
-        return self.event(t, jnp.concatenate(self.formulation.split(y)))
-
-
-def with_modes_of_systems(hybrid: Hybrid) -> Hybrid:
-    """The hybrid system with the equations of motion of the mechanical systems among its modes, for states (q, rate)."""
-    modes = tuple(
-        MechanicalMode(Lagrange(mode), number) if isinstance(mode, AbstractSystem) else mode
-        for number, mode in enumerate(hybrid.modes)
-    )
-    return dataclasses.replace(hybrid, modes=modes)
-
-
 # The form of a system: what is left without its numbers.
 
 #: The last argument of a reset, in words for a message.
@@ -240,6 +96,33 @@ EXIT = "; and exit, which of them fell, if the mode has several margins"
 
 #: A function of the numbers, the time and the state of one run.
 OfRun = Function
+
+
+#: A field with more operations on arrays is large: that of a car with a trailer has 800, that of a top in Euler angles 150.
+LARGE = 500
+
+
+class Traits(NamedTuple):
+    """The traits of a hybrid system, found by tracing its functions.
+
+    - `depends_on_time`: whether a function depends on time, which is then an additional component of the state.
+    - `elementary`: whether all functions that are evaluated within steps fit a single kernel.
+    - `ends`, `resets`: for each mode, the number of its margins, and whether it also has a reset.
+    - `projected`: for each mode, whether it has constraints that a state may violate.
+    - `large`: for each mode, whether its field takes much longer to compile than to compute.
+    """
+
+    depends_on_time: bool
+    elementary: bool
+    ends: tuple[int, ...]
+    resets: tuple[bool, ...]
+    projected: tuple[bool, ...]
+    large: tuple[bool, ...]
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a run is one smooth motion, without resets."""
+        return len(self.ends) == 1 and not self.resets[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,16 +153,21 @@ class Form:
 
         def called(numbers: Sequence[Array], t: Array, y: State, exit: ArrayLike = 0) -> PyTree:
             system = self.tree.tree(numbers)
+            part: Any = system.modes[mode]
             if name == "event":
                 assert system.event is not None
-                return system.event(t, y)
-            part: Any = system.modes[mode]
+                return system.event(t, components_of(part, y))
             if name == "margins":
                 margin = part.margin(t, y)
                 if isinstance(margin, dict):
                     return tuple(map(jnp.asarray, margin.values()))
                 return (margin,) if jnp.ndim(margin) == 0 else tuple(margin[k] for k in range(margin.shape[0]))
-            return getattr(part, name)(t, y, *(exit_of(part.margin(t, y), exit) if name == "reset" else ()))
+            if name != "reset":
+                return getattr(part, name)(t, y)
+            following: Any = part.reset(t, y, *exit_of(part.margin(t, y), exit))
+            # A mechanical system need not name the next mode.
+            is_unnamed = isinstance(part, AbstractFormulation) and following is not None
+            return (*following, mode)[:2] if is_unnamed else following
 
         return called
 
@@ -297,83 +185,53 @@ class Form:
         return self.tree.types, jax.ShapeDtypeStruct((), real), jax.ShapeDtypeStruct((self.size,), real)
 
     @property
-    def traits(self) -> "Traits":
-        """The traits found by tracing the functions."""
-        return _traits(self)
+    @functools.lru_cache(maxsize=256)  # noqa: B019  Equal forms share their traits.
+    def traits(self) -> Traits:
+        """The traits found by tracing the functions, which are also checked.
 
+        **Raises:** `ValueError` that names a function that returns a wrong type or shape.
+        """
+        ends, resets, step_functions, reset_functions = [], [], [], []
+        for k in range(self.modes):
+            _require_shape(self, "field", k, (self.size,))
+            ends.append(_margin_count(self, k))
+            reset = _result(self, "reset", k) if ends[k] else None
+            resets.append(reset is not None)
+            step_functions.append(self.function("field", k))
+            if ends[k]:
+                step_functions.append(self.function("margins", k))
+            if reset is not None:
+                _require_pair(self, k, reset)
+                reset_functions.append(self.function("reset", k))
+        if self.has_event:
+            _require_shape(self, "event", 0, ())
+            step_functions.append(self.function("event"))
 
-#: A field with more operations on arrays is large: that of a car with a trailer has 800, that of a top in Euler angles 150.
-LARGE = 500
+        def combined(functions: list[OfRun]) -> OfRun:
+            return lambda t, y, *numbers: [function(numbers, t, y) for function in functions]
 
+        numbers, t, y = self.arguments
 
-class Traits(NamedTuple):
-    """The traits of a hybrid system, found by tracing its functions.
+        def warned(numbers: Sequence[Array]) -> None:
+            for k, own in itertools.product(range(self.modes), ("field", "margins")):
+                if own == "field" or ends[k]:
+                    warn_of_unclear(_name(own.rstrip("s"), k), functools.partial(self.function(own, k), numbers), y)
 
-    - `depends_on_time`: whether a function depends on time, which is then an additional component of the state.
-    - `elementary`: whether all functions that are evaluated within steps fit a single kernel.
-    - `ends`, `resets`: for each mode, the number of its margins, and whether it also has a reset.
-    - `projected`: for each mode, whether it has constraints that a state may violate.
-    - `large`: for each mode, whether its field takes much longer to compile than to compute.
-    """
-
-    depends_on_time: bool
-    elementary: bool
-    ends: tuple[int, ...]
-    resets: tuple[bool, ...]
-    projected: tuple[bool, ...]
-    large: tuple[bool, ...]
-
-    @property
-    def smooth(self) -> bool:
-        """Whether a run is one smooth motion, without resets."""
-        return len(self.ends) == 1 and not self.resets[0]
-
-
-@functools.lru_cache(maxsize=256)
-def _traits(form: Form) -> Traits:
-    """The traits of a form; also checks its functions.
-
-    **Raises:** `ValueError` that names a function that returns a wrong type or shape.
-    """
-    ends, resets, step_functions, reset_functions = [], [], [], []
-    for k in range(form.modes):
-        _require_shape(form, "field", k, (form.size,))
-        ends.append(_margin_count(form, k))
-        reset = _result(form, "reset", k) if ends[k] else None
-        resets.append(reset is not None)
-        step_functions.append(form.function("field", k))
-        if ends[k]:
-            step_functions.append(form.function("margins", k))
-        if reset is not None:
-            _require_pair(form, k, reset)
-            reset_functions.append(form.function("reset", k))
-    if form.has_event:
-        _require_shape(form, "event", 0, ())
-        step_functions.append(form.function("event"))
-
-    def combined(functions: list[OfRun]) -> OfRun:
-        return lambda t, y, *numbers: [function(numbers, t, y) for function in functions]
-
-    numbers, t, y = form.arguments
-
-    def warned(numbers: Sequence[Array]) -> None:
-        for k, own in itertools.product(range(form.modes), ("field", "margins")):
-            if own == "field" or ends[k]:
-                warn_of_unclear(_name(own.rstrip("s"), k), functools.partial(form.function(own, k), numbers), y)
-
-    modes = form.tree.tree([jnp.zeros((), kind.dtype) for kind in numbers]).modes
-    fields = [traced(spelled_out(form.function("field", k)), numbers, t, y)[0] for k in range(form.modes)]
-    depends_on_time = depends_on_first(combined([*step_functions, *reset_functions]), t, y, *numbers)
-    if depends_on_time:
-        jax.eval_shape(warned, numbers)
-    return Traits(
-        depends_on_time,
-        is_elementary(spelled_out(combined(step_functions)), t, y, *numbers),
-        tuple(ends),
-        tuple(resets),
-        tuple(getattr(mode, "is_projected", False) for mode in modes),
-        tuple(len(equations_in(field)) > LARGE for field in fields),
-    )
+        modes = self.tree.tree([jnp.zeros((), kind.dtype) for kind in numbers]).modes
+        fields = [traced(spelled_out(self.function("field", k)), numbers, t, y)[0] for k in range(self.modes)]
+        depends_on_time = any(
+            dependent_outputs(combined([*step_functions, *reset_functions]), t, y, *numbers, on_first_alone=True)
+        )
+        if depends_on_time:
+            jax.eval_shape(warned, numbers)
+        return Traits(
+            depends_on_time,
+            is_elementary(spelled_out(combined(step_functions)), t, y, *numbers),
+            tuple(ends),
+            tuple(resets),
+            tuple(isinstance(mode, AbstractFormulation) and mode.is_projected for mode in modes),
+            tuple(len(equations_in(field)) > LARGE for field in fields),
+        )
 
 
 def _name(name: str, mode: int) -> str:
@@ -467,7 +325,7 @@ def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
             raise ValueError(
                 f"{prefix}lagrangian: a system with a Lagrangian of its own cannot be a mode; write metric and potential"
             )
-        form = Form.of(Hybrid([MechanicalMode(Lagrange(mode))]), 2 * mode.dimension)[0]
+        form = Form.of(Hybrid([Lagrange(mode)]), 2 * mode.dimension)[0]
         _check_functions(form, prefix)
 
 
@@ -485,7 +343,7 @@ def _check_vector(value: Any, name: str, size: int | None) -> None:
 def _check_functions(form: Form, prefix: str) -> None:
     """Raise `ValueError` that names a function of a system that JAX cannot trace or that returns a wrong shape.
 
-    **Arguments:** `form`: that of a `Hybrid` of one `MechanicalMode`, so that a system with other numbers is not traced
+    **Arguments:** `form`: that of a `Hybrid` of one formulation, so that a system with other numbers is not traced
     again; `prefix`: that of the names of the functions.
     """
     n = form.size // 2
@@ -515,7 +373,7 @@ def _check_functions(form: Form, prefix: str) -> None:
 
     def called(method: str, numbers: Sequence[Array], *arguments: Array) -> PyTree:
         mode: Any = form.tree.tree(numbers).modes[0]
-        system = mode.formulation.system
+        system = mode.system
         exit = exit_of(system.margin(*arguments), 0) if method == "reset" else ()
         return getattr(system, method)(*arguments, *exit)
 

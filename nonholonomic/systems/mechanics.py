@@ -25,6 +25,98 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import solve
 
+# A mode as equations of motion.
+
+State = Float[Array, " components"]
+
+#: What the `margin` of a mode returns, and its `reset`.
+Margin = Float[Array, "..."] | dict[str, Float[Array, ""]] | None
+Reset = tuple[State, Any] | None
+
+
+def exit_of(margin: Any, number: ArrayLike) -> tuple[Any, ...]:
+    """The further argument of a reset after the margin of this index has fallen, if there are several: the index, or for a
+    dict whether it is the margin of each name."""
+    if isinstance(margin, dict):
+        return ({name: jnp.asarray(number) == k for k, name in enumerate(margin)},)
+    return () if jnp.ndim(margin) == 0 else (jnp.asarray(number),)
+
+
+class AbstractMode(eqx.Module):
+    """A mode of a hybrid system: its equations of motion, its end, and the next mode. Subclass it, declare the
+    parameters of your model as attributes, and write functions of a single time and a single state with `jax.numpy`.
+    A class attribute such as `names = ("height", "velocity")` names the components of the state.
+    You can sweep, fit and differentiate every attribute that is a float or an array. A mode that never ends needs only
+    the method `field`.
+
+    **Example:** a ball that falls and bounces.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Ball(nonholonomic.AbstractMode):
+    ...     gravity: float = 9.81
+    ...     restitution: float = 0.8
+    ...
+    ...     def field(self, t, y):
+    ...         return jnp.array([y[1], -self.gravity])
+    ...
+    ...     def margin(self, t, y):
+    ...         return y[0]
+    ...
+    ...     def reset(self, t, y):
+    ...         return jnp.array([0.0, -self.restitution * y[1]]), 0
+    >>> ball = nonholonomic.Hybrid([Ball()], event=lambda t, y: y[1])
+    >>> time = nonholonomic.event_time(ball, jnp.array([1.0, 0.0]), t1=5.0)
+    >>> print(f"highest again after {time:.4f} s")
+    highest again after 0.8127 s
+
+    ```
+    """
+
+    #: Names of the components of the state, such as ("height", "velocity"), in tables and pictures; by default "y0", "y1"
+    #: and so on. One mode of a `Hybrid` is enough.
+    names: ClassVar[tuple[str, ...] | None] = None
+
+    @abc.abstractmethod
+    def field(self, t: Float[Array, ""], y: State) -> State:
+        """Rate of change of the state.
+
+        **Arguments:** `t`: time [s]; `y`: state, (components,).
+
+        **Returns:** the rate, (components,).
+        """
+
+    def margin(self, t: Float[Array, ""], y: State) -> Margin:
+        """A smooth function that is positive while the mode holds and falls through zero where it ends; or several such
+        functions, of which the first to fall ends the mode.
+
+        The function may change faster than the motion, as the height above a vibrating table or above waves: no zero is
+        missed, unless the function contains an operation without bounds, such as a loop.
+
+        **Arguments:** as for `field`.
+
+        **Returns:** a number; several in an array, (k,), or in a dict by name; or `None`, the default, for a mode that never
+        ends.
+        """
+        return None
+
+    def reset(self, t: Float[Array, ""], y: State) -> Reset:
+        """The state and mode that follow when the margin has fallen to zero.
+
+        The margin of the next state may be zero if it then rises, as for a ball that has just bounced.
+
+        **Arguments:** as for `field`, at the end of the mode. If there are several margins, write `reset(self, t, y, exit)`:
+        `exit` is the index of the margin that fell in the array, a traced whole number, or for a dict a dict that is true for
+        the name of the margin that fell and false for the others. Of margins that fall at the same time, the first one counts,
+        and the others follow at once.
+
+        **Returns:** the next state, (components,), and the index of the next mode in `Hybrid.modes`, a whole number
+        that may depend on the state; or `None`, the default, if the run ends here.
+        """
+        return None
+
+
 # A mechanical system as data: its metric, potential, constraints and forces, and how it strikes its surroundings.
 
 Coordinates = Float[Array, " n"]
@@ -225,8 +317,8 @@ def lie_brackets(fields: Callable[[Coordinates], Float[Array, "n m"]], q: Coordi
     return derivatives - jnp.swapaxes(derivatives, 1, 2)
 
 
-class AbstractFormulation(eqx.Module):
-    """Equations of motion of a system, as a first-order field of their own state.
+class AbstractFormulation(AbstractMode):
+    """Equations of motion of a system, as a first-order field of their own state; a mode of a hybrid system.
 
     **Arguments:**
 
@@ -234,6 +326,9 @@ class AbstractFormulation(eqx.Module):
     """
 
     system: eqx.AbstractVar[AbstractSystem]
+
+    #: Whether states may have rates that violate the constraints, so that `entered` changes them.
+    is_projected: ClassVar[bool] = False
 
     @abc.abstractmethod
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
@@ -243,19 +338,30 @@ class AbstractFormulation(eqx.Module):
     def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
         """Coordinates and velocity, each (n,), of a state."""
 
-    @abc.abstractmethod
-    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
-        """Rate of change of the state, with the signature of a Diffrax vector field."""
-
     def acceleration(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
         """Second derivative of the coordinates, by the chain rule through this formulation's state."""
         state = self.state(q, rate)
-        _, (_, acceleration) = jax.jvp(self.split, (state,), (self.field(t, state),))
+        _, (_, acceleration) = jax.jvp(self.split, (state,), (self.field(jnp.asarray(t), state),))
         return acceleration
 
-    def energy(self, state: Float[Array, " state"]) -> Float[Array, ""]:
-        """Energy at a state."""
-        return self.system.energy(*self.split(state))
+    def margin(self, t: Float[ArrayLike, ""], y: State) -> Margin:
+        return self.system.margin(t, *self.split(y))
+
+    def reset(self, t: Float[ArrayLike, ""], y: State, *exit: Any) -> tuple[Any, ...] | None:
+        """The state after a reset, and the index of the next mode if the system names it."""
+        system: Any = self.system
+        following = system.reset(t, *self.split(y), *exit)
+        return None if following is None else (self.state(*following[:2]), *following[2:])
+
+    def entered(self, t: Float[ArrayLike, ""], y: State) -> State:
+        """The state after a reset to this mode, with rates that obey the constraints."""
+        q, rate = self.split(y)
+        return self.state(q, within_constraints(self.system, q, rate))
+
+
+def components_of(mode: object, y: State) -> State:
+    """A state in the user's components, which are coordinates and their rates for a mechanical system."""
+    return jnp.concatenate(mode.split(y)) if isinstance(mode, AbstractFormulation) else y
 
 
 class Hamel(AbstractFormulation):
@@ -285,9 +391,9 @@ class Hamel(AbstractFormulation):
         q, u = self.quasi_velocity(state)
         return q, self.system.frame(q) @ u
 
-    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
+    def field(self, t: Float[ArrayLike, ""], y: State, args=None) -> State:
         system, free = self.system, self.system.freedom
-        q, u = self.quasi_velocity(state)
+        q, u = self.quasi_velocity(y)
         E = system.frame(q)
         rate = E @ u
 
@@ -318,6 +424,10 @@ class Lagrange(AbstractFormulation):
 
     system: AbstractSystem
 
+    @property
+    def is_projected(self) -> bool:
+        return self.system.freedom < self.system.dimension
+
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
         return jnp.concatenate([q, rate])
 
@@ -325,8 +435,8 @@ class Lagrange(AbstractFormulation):
         q, rate = jnp.split(state, 2)
         return q, rate
 
-    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
-        q, rate = self.split(state)
+    def field(self, t: Float[ArrayLike, ""], y: State, args=None) -> State:
+        q, rate = self.split(y)
         return jnp.concatenate([rate, self.acceleration(t, q, rate)])
 
     def acceleration(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:

@@ -3,8 +3,8 @@
 import dataclasses
 import functools
 import operator
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
 from ..integration.problem import CROSSED, FAILED, UNRESOLVED, Status
 from ..parameters import Parameters, checks_of, require_apart, short_names
+from ..runs.event import UNMEASURED
 from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import (
@@ -36,25 +37,15 @@ from ..text import name_of, shown
 from ..validation import as_number, is_traced
 from ..views import Stage
 from ..views.explore import Frame, LiveRun, Summary
-from .engine import Cells
-from .form import (
-    AbstractMode,
-    Event,
-    Form,
-    Hybrid,
-    MechanicalEvent,
-    MechanicalMode,
-    arguments_in_words,
-    check_start,
-    is_pair,
-    require_event,
-    with_modes_of_systems,
-)
+from .engine import ROUND_OFF, BatchedMode, time_and_state
+from .form import Event, Form, Hybrid, arguments_in_words, check_start, is_pair, require_event
 from .mechanics import (
     RULES,
-    AbstractFormulation,
+    AbstractMode,
     AbstractSystem,
+    Lagrange,
     Parts,
+    components_of,
     formulation_of,
     parts_of_system,
     problem_of_start,
@@ -75,10 +66,12 @@ class OwnModel(AbstractModel):
     names: tuple[str, ...] = eqx.field(static=True)
     event: None = None
 
+    words: ClassVar[tuple[str, ...]] = ("event", "completed", "stopped", "failed", "unresolved", "illegal")
+
     @classmethod
     def of(cls, tree: dict[str, Any]) -> "OwnModel":
         """The model of a system, its start and its event."""
-        hybrid, state, _ = assembled(tree)
+        hybrid, state = assembled(tree)
         form = Form.of(hybrid, state.size)[0]
         form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
         return cls(parameters=Parameters.of(tree), form=form, names=names_of(tree["system"], form.size))
@@ -160,34 +153,42 @@ class OwnModel(AbstractModel):
         return {} if self.smooth else {"switches": "resets"}
 
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
-        return self._cells(cells).problem(cells)
+        # A smooth run starts without an error.
+        modes, _, states = self.modes(cells, ROUND_OFF, names, False)
+        return modes[self.form.first].problem(states)
 
-    def modes(self, cells: int, tolerance: ArrayLike, names: Names, continues: bool) -> Start:
-        return self._cells(cells).modes(cells, tolerance, continues)
+    def modes(self, cells: int | None, tolerance: ArrayLike, names: Names, continues: bool) -> Start:
+        numbers, start = self._runs(cells)
+        shape = () if cells is None else (cells,)
+        states = jnp.stack([jnp.broadcast_to(part, shape) for part in start])
+        # The errors scale with the largest component of a start, but at most 1.
+        magnitude = jnp.max(jnp.abs(jax.lax.stop_gradient(states)), axis=0)
+        scales = jnp.broadcast_to(jnp.where(magnitude > 0.0, jnp.minimum(magnitude, 1.0), 1.0), states.shape)
+        if self.form.traits.depends_on_time:
+            clock = jnp.zeros((1, *shape))
+            states, scales = jnp.concatenate([states, clock]), jnp.concatenate([scales, clock + UNMEASURED])
+        shared = (numbers, scales, jax.lax.stop_gradient(jnp.asarray(tolerance, float)), self.form)
+        modes = tuple(BatchedMode(*shared, mode, continues) for mode in range(self.form.modes))
+        return modes, jnp.full(shape, self.form.first), states
 
-    def _cells(self, size: int | None) -> Cells:
-        """The runs in the form for the engine, with an axis of cells for the numbers that differ."""
+    def _runs(self, cells: int | None) -> tuple[tuple[Array, ...], list[Array]]:
+        """The numbers of the hybrid system and the components of the starts, with an axis of cells where they differ."""
         values = self.parameters.values
-
-        def of_one(*numbers: Array) -> Cells:
-            hybrid, state, _ = assembled(self.parameters.form.tree(numbers))
-            form, own = Form.of(hybrid, state.size)
-            return Cells(own, tuple(jnp.unstack(state)), form)
-
         moving = [k for k, value in enumerate(values) if jnp.ndim(value)]
-        if not moving:
-            return of_one(*values)
 
-        def of_moving(*numbers: Array) -> Cells:
+        def of_one(*numbers: Array) -> tuple[tuple[Array, ...], list[Array]]:
             all_values = list(values)
             for k, number in zip(moving, numbers, strict=True):
                 all_values[k] = number
-            return of_one(*all_values)
+            hybrid, state = assembled(self.parameters.form.tree(all_values))
+            return Form.of(hybrid, state.size)[1], list(jnp.unstack(state))
 
+        if not moving:
+            return of_one()
         point = [values[k] for k in moving]
         first = [number[0] for number in point]
-        single, batch = of_moving(*first), jax.vmap(of_moving, axis_size=size)(*point)
-        depends = dependent_outputs(of_moving, *first)
+        single, batch = of_one(*first), jax.vmap(of_one, axis_size=cells)(*point)
+        depends = dependent_outputs(of_one, *first)
         leaves = zip(jax.tree.leaves(batch), jax.tree.leaves(single), depends, strict=True)
         return jax.tree.unflatten(jax.tree.structure(single), [a if d else b for a, b, d in leaves])
 
@@ -199,7 +200,19 @@ class OwnModel(AbstractModel):
         return OwnModel.of(tree | {"system": system, "event": None})
 
     def direction(self, cells: int) -> Float[Array, "components cells"]:
-        return self._cells(cells).within_constraints(super().direction(cells))
+        changes, form = super().direction(cells), self.form
+        if not form.traits.projected[form.first]:
+            return changes
+        entered = form.function("entered", form.first)
+
+        def of_one(numbers: Sequence[Array], state: Array, change: Array) -> Array:
+            t, y = time_and_state(form, tuple(state))
+            _, allowed = jax.jvp(lambda y: entered(numbers, t, y), (y,), (change[: form.size],))
+            return jnp.concatenate([allowed, change[form.size :]])
+
+        (numbers, _), states = self._runs(cells), self.modes(cells, ROUND_OFF, self.comparable, False)[2]
+        axes = tuple(0 if jnp.ndim(number) else None for number in numbers)
+        return jax.vmap(of_one, in_axes=(axes, 1, 1), out_axes=1)(numbers, states, changes)
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -212,13 +225,12 @@ class OwnModel(AbstractModel):
 
     def components_of(self, rows: Float[Array, "rows *cells"]) -> Float[Array, "components *cells"]:
         """States of the engine in the user's components."""
+        values = self.parameters.values
 
         def of_one(state: Array, *numbers: Array) -> Array:
-            state = state[: self.form.size]
-            formulation = assembled(self.parameters.form.tree(numbers))[2]
-            return state if formulation is None else jnp.concatenate(formulation.split(state))
+            hybrid, _ = assembled(self.parameters.form.tree(numbers))
+            return components_of(hybrid.modes[0], state[: self.form.size])
 
-        values = self.parameters.values
         if rows.ndim == 1:
             return of_one(rows, *values)
         axes = tuple(0 if jnp.ndim(value) else None for value in values)
@@ -243,14 +255,15 @@ def state_of(start: Array | dict[str, Array]) -> Array:
     return jnp.concatenate([start["q"], start["rate"]]) if isinstance(start, dict) else start
 
 
-def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array, AbstractFormulation | None]:
-    """A system as a `Hybrid`, the state at its start, and the formulation of a mechanical system."""
+def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array]:
+    """A system as a `Hybrid` of equations of motion, and the state at its start."""
     system, start, event = tree["system"], tree["start"], tree["event"]
     if isinstance(system, Hybrid):
-        return with_modes_of_systems(system), state_of(start), None
+        # The states of mechanical systems in it are (q, rate).
+        modes = tuple(Lagrange(mode) if isinstance(mode, AbstractSystem) else mode for mode in system.modes)
+        return dataclasses.replace(system, modes=modes), state_of(start)
     formulation = formulation_of(system)
-    event = None if event is None else MechanicalEvent(formulation, event)
-    return Hybrid([MechanicalMode(formulation)], event), formulation.state(start["q"], start["rate"]), formulation
+    return Hybrid([formulation], event), formulation.state(start["q"], start["rate"])
 
 
 def _all_left(left: Parts) -> Any:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from ...compilation.components import AbstractScalarReader, rows_along
-from ...compilation.xla_cpu import Equation, called_program, opened, programs_of, traced
+from ...compilation.xla_cpu import Equation, Program, called_program, opened, programs_of, traced
 
 #: A number: a Python number if known, otherwise its name or text in JavaScript. A value is an array of numbers.
 Number = str | float
@@ -116,11 +116,6 @@ def _text(number: Number) -> str:
     return f"({text})" if text.startswith("-") else text
 
 
-def _value(array: Any) -> Value:
-    """A known array as Python numbers."""
-    return np.asarray(array).astype(object)
-
-
 def _map(function: Callable[..., Number], *values: Value) -> Value:
     """Apply a function of numbers to every element of some values."""
     # NaN is NaN in JavaScript, too.
@@ -156,16 +151,17 @@ class _Block(AbstractScalarReader):
         return [line for lines in reversed(blocks) for line in lines], names
 
     def constants(self, array: ArrayLike) -> Value:
-        return _value(array)
+        """A known array as Python numbers."""
+        return np.asarray(array).astype(object)
 
-    def apply(self, equation: Equation, inputs: Values) -> Sequence[Value]:
+    def apply(self, equation: Equation, inputs: Values) -> Sequence[Value] | Program:
         name, parameters = equation.primitive.name, equation.params
         if name in SAME:
             return inputs
         if name in ("while", "cond", "scan"):
             return getattr(self, f"{name}_")(inputs, **parameters)
         if (inner := called_program(equation)) is not None:
-            return self.read(inner, inputs)
+            return inner
         if name in INDEXED:
             return self.indexed(equation, inputs, range(len(inputs))[INDEXED[name]])
         if name == "cumsum":
@@ -176,35 +172,9 @@ class _Block(AbstractScalarReader):
             return [self.extreme("lt" if name == "argmin" else "gt", inputs[0], parameters["axes"][0])]
         return super().apply(equation, inputs)
 
-    def kind(self, equation: Equation) -> str:
-        """An elementwise operation: the name of a primitive, or JavaScript."""
-        name, parameters = equation.primitive.name, equation.params
-        types = [atom.aval.dtype for atom in equation.invars]
-        if name == "integer_pow":
-            power = " * ".join(["{0}"] * abs(parameters["y"])) or "1"
-            return power if parameters["y"] >= 0 else f"1 / ({power})"
-        if name == "polynomial":
-            return functools.reduce(
-                lambda terms, k: f"({terms}) * {{0}} + {{{k}}}", range(len(types) - 2, 0, -1), f"{{{len(types) - 1}}}"
-            )
-        if name == "select_n":
-            chain = (f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, len(types)))
-            return CHOICE if types[0] == np.bool_ else "".join(chain) + "NaN"
-        if name == "not":
-            return "!{}" if types[0] == np.bool_ else "~{}"
-        if name == "div" and np.issubdtype(types[0], np.integer):
-            return "Math.trunc({} / {})"
-        if name == "convert_element_type":
-            if parameters["new_dtype"] == np.bool_:
-                return "{} != 0"
-            cut = np.issubdtype(parameters["new_dtype"], np.integer) and np.issubdtype(types[0], np.floating)
-            return "Math.trunc({})" if cut else "+{}" if types[0] == np.bool_ else "{}"
-        if name not in ELEMENTWISE:
-            known = f"use some of {', '.join(sorted(ELEMENTWISE))}"
-            raise ValueError(f"the primitive {name!r} of JAX cannot be written in JavaScript; {known}")
-        return name
-
     def element(self, name: str, *numbers: Number, equation: Equation | None = None) -> Number:
+        if equation is not None:
+            name = _operation(equation)
         if name in KNOWN and not _strings(numbers):
             return KNOWN[name](*numbers)
         if name == "{}":
@@ -219,7 +189,7 @@ class _Block(AbstractScalarReader):
             return [self.each(CHOICE, is_better, *pair) for pair in zip(extreme, candidate, strict=True)]
 
         rows = enumerate(rows_along(value, axis))
-        return functools.reduce(choose, ([_value(np.full(row.shape, number)), row] for number, row in rows))[0]
+        return functools.reduce(choose, ([self.constants(np.full(row.shape, number)), row] for number, row in rows))[0]
 
     def indexed(self, equation: Equation, inputs: Values, indices: Sequence[int]) -> Values:
         """Elements at indices that may be known only in JavaScript, which then selects among all possible indices."""
@@ -235,7 +205,7 @@ class _Block(AbstractScalarReader):
             operands, matches = [value.copy() for value in labelled], []
             for (k, index), choice in zip(unknown, option, strict=True):
                 operands[k][index] = choice
-                matches.append(self.each("eq", np.asarray(inputs[k][index], object), _value(choice)))
+                matches.append(self.each("eq", np.asarray(inputs[k][index], object), self.constants(choice)))
             # An index beyond the end gives -1, which is not a label.
             parameters = equation.params | ({"fill_value": -1} if "fill_value" in equation.params else {})
             output = equation.primitive.bind(*(operand.astype(int) for operand in operands), **parameters)
@@ -309,6 +279,35 @@ class _Block(AbstractScalarReader):
             reads |= inside_reads
         self.statements.append((names, reads, [*lines, "}"]))
         return variables
+
+
+def _operation(equation: Equation) -> str:
+    """An elementwise operation: the name of a primitive, or JavaScript."""
+    name, parameters = equation.primitive.name, equation.params
+    types = [atom.aval.dtype for atom in equation.invars]
+    if name == "integer_pow":
+        power = " * ".join(["{0}"] * abs(parameters["y"])) or "1"
+        return power if parameters["y"] >= 0 else f"1 / ({power})"
+    if name == "polynomial":
+        return functools.reduce(
+            lambda terms, k: f"({terms}) * {{0}} + {{{k}}}", range(len(types) - 2, 0, -1), f"{{{len(types) - 1}}}"
+        )
+    if name == "select_n":
+        chain = (f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, len(types)))
+        return CHOICE if types[0] == np.bool_ else "".join(chain) + "NaN"
+    if name == "not":
+        return "!{}" if types[0] == np.bool_ else "~{}"
+    if name == "div" and np.issubdtype(types[0], np.integer):
+        return "Math.trunc({} / {})"
+    if name == "convert_element_type":
+        if parameters["new_dtype"] == np.bool_:
+            return "{} != 0"
+        cut = np.issubdtype(parameters["new_dtype"], np.integer) and np.issubdtype(types[0], np.floating)
+        return "Math.trunc({})" if cut else "+{}" if types[0] == np.bool_ else "{}"
+    if name not in ELEMENTWISE:
+        known = f"use some of {', '.join(sorted(ELEMENTWISE))}"
+        raise ValueError(f"the primitive {name!r} of JAX cannot be written in JavaScript; {known}")
+    return name
 
 
 def _flat(values: Sequence[Value]) -> list[Number]:

@@ -132,7 +132,7 @@ def test_chaplygin_sleigh(formulation):
     def computed(q, rate):
         state = formulation.state(q, rate)
         acceleration = formulation.acceleration(0.0, q, rate)
-        return state, formulation.split(state)[1], acceleration, formulation.energy(state)
+        return state, formulation.split(state)[1], acceleration, formulation.system.energy(*formulation.split(state))
 
     state, velocity, acceleration, energy = computed(q, rate)
     assert state.size == (6 if isinstance(formulation, (Multipliers, Lagrange, ConstrainedConnection)) else 5)
