@@ -85,7 +85,7 @@ class ModeProblem(AbstractProblem):
     def exact_margin(self, time: Lanes, state: States) -> Lanes | None:
         return least(*self.mode.in_lanes("margins", state)) if self.mode.margins else None
 
-    def lostat_start(self, state: States) -> Bool[Array, "..."] | None:
+    def lost_at_start(self, state: States) -> Bool[Array, "..."] | None:
         if self.allowances is None:
             return None
         value, slope, error, slope_error, is_tangential = self.at_start()
