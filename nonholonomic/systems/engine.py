@@ -8,7 +8,7 @@ time is an additional component of the state.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from ..compilation.components import over_lanes
 from ..compilation.tracing import in_cells
 from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
+from ..hybrid.ensemble import over_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from ..runs.event import UNMEASURED
@@ -214,9 +215,7 @@ class BatchedMode(AbstractBatchedMode):
         An event at the end of the mode comes before the reset. If the reset jumps over the zero of the event function,
         the event happens at the reset, and the run ends between two modes.
         """
-        axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
-        reset = jax.vmap(self._reset_one, in_axes=(axes, 1, 1, 0), out_axes=_TRANSITION_AXES)
-        return reset(self.numbers, state, self.scales, self._exit(stop_gradient(state)))
+        return over_cells(_after_reset, self)(state, self._exit(stop_gradient(state)))
 
     def _exit(self, state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
         """The index of the margin that ended the mode: the first of those that are least up to round-off and fall."""
@@ -228,49 +227,41 @@ class BatchedMode(AbstractBatchedMode):
         steepest = jnp.argmin(jnp.where(is_least, slope, jnp.inf), axis=0)
         return jnp.where(jnp.any(falls, axis=0), jnp.argmax(falls, axis=0), steepest)
 
-    def _reset_one(
-        self,
-        numbers: Sequence[Array],
-        state: Float[Array, " components"],
-        scales: Float[Array, " components"],
-        exit: Int[Array, ""],
-    ) -> Transition:
-        form, zero, now, never = self.form, jnp.zeros((), int), jnp.zeros(()), jnp.asarray(jnp.inf)
-        if not form.traits.resets[self.index]:
-            return Transition(zero + self.index, state, now, zero + LEFT_DOMAIN, never, zero[None])
-        t, y = time_and_state(form, tuple(state))
-        state_after, number = form.function("reset", self.index)(numbers, t, y, exit)
-        number = jnp.asarray(number).astype(int)
-        for mode, is_projected in enumerate(form.traits.projected):
-            if is_projected:
-                projected = form.function("entered", mode)(numbers, t, state_after)
-                state_after = jnp.where(number == mode, projected, state_after)
-        state_after = jnp.concatenate([state_after, state[form.size :]])
-        status = jnp.where((number >= 0) & (number < form.modes), RUNNING, FAILED)
-        if not form.has_event:
-            return Transition(number, state_after, now, status, never, zero[None] + 1)
 
-        def value(state: Float[Array, " components"]) -> Float[Array, ""]:
-            return form.function("event")(numbers, *time_and_state(form, tuple(state)))
+def _after_reset(mode: BatchedMode, state: Float[Array, " components"], exit: Int[Array, ""]) -> Transition:
+    """The transition of one run at the end of its mode, whose margin of index `exit` fell."""
+    numbers, scales = mode.numbers, mode.scales
+    form, zero, now, never = mode.form, jnp.zeros((), int), jnp.zeros(()), jnp.asarray(jnp.inf)
+    if not form.traits.resets[mode.index]:
+        return Transition(zero + mode.index, state, now, zero + LEFT_DOMAIN, never, zero[None])
+    t, y = time_and_state(form, tuple(state))
+    state_after, number = form.function("reset", mode.index)(numbers, t, y, exit)
+    number = jnp.asarray(number).astype(int)
+    for k, is_projected in enumerate(form.traits.projected):
+        if is_projected:
+            projected = form.function("entered", k)(numbers, t, state_after)
+            state_after = jnp.where(number == k, projected, state_after)
+    state_after = jnp.concatenate([state_after, state[form.size :]])
+    status = jnp.where((number >= 0) & (number < form.modes), RUNNING, FAILED)
+    if not form.has_event:
+        return Transition(number, state_after, now, status, never, zero[None] + 1)
 
-        rate = jnp.concatenate([form.function("field", self.index)(numbers, t, y), jnp.ones(len(state) - form.size)])
-        sizes = jnp.abs(state) + jnp.where(scales < UNMEASURED, scales, 0.0)
-        is_zero = jnp.abs(value(state)) <= ROUND_OFF * jnp.sum(jnp.abs(jax.jacfwd(value)(state)) * sizes)
-        ends = is_zero & (jax.jvp(value, (state,), (rate,))[1] < 0.0)
-        jumps = ~ends & (value(state) > 0.0) & (value(state_after) <= 0.0)
-        crossed = ends | jumps
-        if self.continues:
-            return Transition(number, state_after, now, status, jnp.where(crossed, now, never), zero[None] + 1)
-        return Transition(
-            mode=jnp.where(ends, self.index, jnp.where(jumps, form.modes, number)),
-            state=jnp.where(ends, state, state_after),
-            elapsed=now,
-            status=jnp.where(crossed, CROSSED, status),
-            crossing_time=jnp.where(crossed, now, never),
-            counts=jnp.where(ends, 0, 1)[None],
-        )
+    def value(state: Float[Array, " components"]) -> Float[Array, ""]:
+        return form.function("event")(numbers, *time_and_state(form, tuple(state)))
 
-
-#: The axis of cells in a `Transition`, for `vmap`.
-_AXES: Any = (0, 1, 0, 0, 0, 1, None, None)
-_TRANSITION_AXES = Transition(*_AXES)
+    rate = jnp.concatenate([form.function("field", mode.index)(numbers, t, y), jnp.ones(len(state) - form.size)])
+    sizes = jnp.abs(state) + jnp.where(scales < UNMEASURED, scales, 0.0)
+    is_zero = jnp.abs(value(state)) <= ROUND_OFF * jnp.sum(jnp.abs(jax.jacfwd(value)(state)) * sizes)
+    ends = is_zero & (jax.jvp(value, (state,), (rate,))[1] < 0.0)
+    jumps = ~ends & (value(state) > 0.0) & (value(state_after) <= 0.0)
+    crossed = ends | jumps
+    if mode.continues:
+        return Transition(number, state_after, now, status, jnp.where(crossed, now, never), zero[None] + 1)
+    return Transition(
+        mode=jnp.where(ends, mode.index, jnp.where(jumps, form.modes, number)),
+        state=jnp.where(ends, state, state_after),
+        elapsed=now,
+        status=jnp.where(crossed, CROSSED, status),
+        crossing_time=jnp.where(crossed, now, never),
+        counts=jnp.where(ends, 0, 1)[None],
+    )
