@@ -88,7 +88,11 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     if folder is None and cache_folder:
         return Path(cache_folder)
     try:
-        place = (user_folder() if folder is None else Path(folder)).expanduser() / environment_name()
+        if folder is None:
+            cache_home = os.environ.get("XDG_CACHE_HOME", "")
+            # The XDG specification says that relative paths must be ignored.
+            folder = (Path(cache_home) if os.path.isabs(cache_home) else Path.home() / ".cache") / "nonholonomic"
+        place = Path(folder).expanduser() / environment_name()
         place.mkdir(parents=True, exist_ok=True)
         remove_damaged(place)
     except (OSError, RuntimeError) as error:
@@ -106,16 +110,6 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     # Another process may be writing the entry that this one reads. Then compile the program and go on.
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry", UserWarning)
     return place
-
-
-def user_folder() -> Path:
-    """The package's folder in the user's cache folder, the same on all systems.
-
-    **Raises:** `RuntimeError` if the user has no home folder.
-    """
-    cache_home = os.environ.get("XDG_CACHE_HOME", "")
-    # The XDG specification says that relative paths must be ignored.
-    return (Path(cache_home) if os.path.isabs(cache_home) else Path.home() / ".cache") / "nonholonomic"
 
 
 def environment_name() -> str:
@@ -157,7 +151,9 @@ def remove_damaged(folder: Path) -> None:
     for entry in folder.glob("*-cache"):
         # Another process may remove the entry, too.
         try:
-            line = _line(entry)
+            # The change time changes on every write, even if the modification time is set back.
+            state = entry.stat()
+            line = f"{entry.name} {state.st_size} {state.st_mtime_ns} {state.st_ctime_ns}".encode()
             if line in entries or sound(entry.read_bytes()):
                 sound_lines.append(line)
             else:
@@ -174,13 +170,6 @@ def remove_damaged(folder: Path) -> None:
         if error.errno not in NO_ROOM:
             raise
         _log.warning("compiled programs can no longer be stored in %s: %s", folder, error)
-
-
-def _line(entry: Path) -> bytes:
-    """The name of an entry and its change time, which changes on every write even if the modification time is set
-    back."""
-    state = entry.stat()
-    return f"{entry.name} {state.st_size} {state.st_mtime_ns} {state.st_ctime_ns}".encode()
 
 
 def sound(entry: bytes) -> bool:

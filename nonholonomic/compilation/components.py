@@ -125,9 +125,12 @@ class AbstractScalarReader(abc.ABC):
         """The elements of an array that is known."""
 
     @abc.abstractmethod
+    def kind(self, equation: Equation) -> str:
+        """The name of an operation that acts element by element. Raises an error for other operations."""
+
+    @abc.abstractmethod
     def element(self, name: str, *numbers: Element, equation: Equation | None = None) -> Element:
-        """The result of an operation, of this name, on single elements; `equation` has the parameters of all but sums and
-        products. Raises an error for an operation that does not act element by element."""
+        """The result of an operation, of this name, on single elements; some operations have parameters in `equation`."""
 
     def read(self, program: Program, arguments: Sequence[Elements]) -> list[Elements]:
         """The results of a program."""
@@ -161,7 +164,7 @@ class AbstractScalarReader(abc.ABC):
         if name == "dot_general":
             left, right, summed = factors(inputs[0], inputs[1], params["dimension_numbers"])
             return [self.reduced("add", self.each("mul", left, right), summed)]
-        return [self.each(name, *inputs, equation=equation)]
+        return [self.each(self.kind(equation), *inputs, equation=equation)]
 
     def reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
         """Combine the elements along some axes, one by one."""
@@ -198,9 +201,12 @@ class Evaluation(AbstractScalarReader):
             elements[index] = constants[index]
         return elements
 
+    def kind(self, equation: Equation) -> str:
+        if equation.primitive.name not in BY_ELEMENT.split():
+            raise TooLarge(equation.primitive.name)
+        return equation.primitive.name
+
     def element(self, name: str, *numbers: Element, equation: Equation | None = None) -> Element:
-        if name not in BY_ELEMENT.split():
-            raise TooLarge(name)
         simplified = _simplified(name, numbers)
         if simplified is not None:
             if name == "mul" and _is_constant(simplified):

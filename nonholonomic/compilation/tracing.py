@@ -474,7 +474,9 @@ def _applied(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose:
     elif name in RULES_WITH_PARAMETERS and (name != "sort" or len(boxes) == 1):
         results = [RULES_WITH_PARAMETERS[name](equation, *boxes)]
     elif loose:
-        return [_anything(variable.aval) for variable in equation.outvars]
+        # Anything.
+        kinds = [(variable.aval.shape, variable.aval.dtype) for variable in equation.outvars]
+        return [Bounds(*(jnp.full(shape, end, kind) for end in _range(kind))) for shape, kind in kinds]
     else:
         raise UnboundedError(name)
     if name == "atan2":
@@ -488,13 +490,11 @@ def _applied(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose:
     return results
 
 
-def _anything(aval: Any) -> Bounds:
-    if jnp.issubdtype(aval.dtype, jnp.floating):
-        least, most = -jnp.inf, jnp.inf
-    else:
-        is_truth = jnp.issubdtype(aval.dtype, bool)
-        least, most = (False, True) if is_truth else (jnp.iinfo(aval.dtype).min, jnp.iinfo(aval.dtype).max)
-    return Bounds(jnp.full(aval.shape, least, aval.dtype), jnp.full(aval.shape, most, aval.dtype))
+def _range(kind: np.dtype) -> tuple[Any, Any]:
+    """The least and the greatest number of a type."""
+    if jnp.issubdtype(kind, jnp.floating):
+        return -jnp.inf, jnp.inf
+    return (False, True) if jnp.issubdtype(kind, bool) else (jnp.iinfo(kind).min, jnp.iinfo(kind).max)
 
 
 def _hull(*corners: Array) -> Bounds:

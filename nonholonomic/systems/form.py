@@ -5,7 +5,6 @@ import dataclasses
 import difflib
 import functools
 import inspect
-import itertools
 from collections.abc import Callable, Sequence
 from types import CodeType
 from typing import Any, NamedTuple
@@ -191,44 +190,35 @@ class Form:
 
         **Raises:** `ValueError` that names a function that returns a wrong type or shape.
         """
-        ends, resets, step_functions, reset_functions = [], [], [], []
-        for k in range(self.modes):
-            _require_shape(self, "field", k, (self.size,))
-            ends.append(_margin_count(self, k))
-            reset = _result(self, "reset", k) if ends[k] else None
-            resets.append(reset is not None)
-            step_functions.append(self.function("field", k))
-            if ends[k]:
-                step_functions.append(self.function("margins", k))
-            if reset is not None:
-                _require_pair(self, k, reset)
-                reset_functions.append(self.function("reset", k))
+        numbers, t, y = self.arguments
+        ends, resets = zip(*(_check_mode(self, k) for k in range(self.modes)), strict=True)
+        within_steps = [
+            (name, k) for k in range(self.modes) for name in ("field", "margins") if name == "field" or ends[k]
+        ]
+        functions = [self.function(*named) for named in within_steps]
         if self.has_event:
             _require_shape(self, "event", 0, ())
-            step_functions.append(self.function("event"))
+            functions.append(self.function("event"))
+        reset_functions = [self.function("reset", k) for k, has_reset in enumerate(resets) if has_reset]
 
-        def combined(functions: list[OfRun]) -> OfRun:
-            return lambda t, y, *numbers: [function(numbers, t, y) for function in functions]
-
-        numbers, t, y = self.arguments
+        def results(functions: list[OfRun], t: Array, y: State, *numbers: Array) -> list[PyTree]:
+            return [function(numbers, t, y) for function in functions]
 
         def warned(numbers: Sequence[Array]) -> None:
-            for k, own in itertools.product(range(self.modes), ("field", "margins")):
-                if own == "field" or ends[k]:
-                    warn_of_unclear(_name(own.rstrip("s"), k), functools.partial(self.function(own, k), numbers), y)
+            for name, k in within_steps:
+                warn_of_unclear(_name(name.rstrip("s"), k), functools.partial(self.function(name, k), numbers), y)
 
-        modes = self.tree.tree([jnp.zeros((), kind.dtype) for kind in numbers]).modes
-        fields = [traced(spelled_out(self.function("field", k)), numbers, t, y)[0] for k in range(self.modes)]
-        depends_on_time = any(
-            dependent_outputs(combined([*step_functions, *reset_functions]), t, y, *numbers, on_first_alone=True)
-        )
+        everything = functools.partial(results, [*functions, *reset_functions])
+        depends_on_time = any(dependent_outputs(everything, t, y, *numbers, on_first_alone=True))
         if depends_on_time:
             jax.eval_shape(warned, numbers)
+        fields = [traced(spelled_out(self.function("field", k)), numbers, t, y)[0] for k in range(self.modes)]
+        modes = self.tree.tree([jnp.zeros((), kind.dtype) for kind in numbers]).modes
         return Traits(
             depends_on_time,
-            is_elementary(spelled_out(combined(step_functions)), t, y, *numbers),
-            tuple(ends),
-            tuple(resets),
+            is_elementary(spelled_out(functools.partial(results, functions)), t, y, *numbers),
+            ends,
+            resets,
             tuple(isinstance(mode, AbstractFormulation) and mode.is_projected for mode in modes),
             tuple(len(equations_in(field)) > LARGE for field in fields),
         )
@@ -250,24 +240,6 @@ def _result(form: Form, name: str, mode: int) -> PyTree:
         return jax.eval_shape(form.function(name, mode), *form.arguments)
 
 
-def _margin_count(form: Form, mode: int) -> int:
-    """The number of margins of a mode. **Raises:** `ValueError` unless they are floats, in an array or a dict if several."""
-    result = _result(form, "margin", mode)
-    if result is None:
-        return 0
-    parts = list(result.values()) if isinstance(result, dict) else [result]
-    most = 0 if isinstance(result, dict) else 1
-    if not parts or not all(hasattr(part, "shape") and part.ndim <= most and part.size for part in parts):
-        raise ValueError(
-            f"{_name('margin', mode)} must return one number, an array of shape (k,), a dict of numbers by name, or None, not "
-            f"{described(result)}"
-        )
-    wrong = [part.dtype for part in parts if not jnp.issubdtype(part.dtype, jnp.floating)]
-    if wrong:
-        raise ValueError(f"{_name('margin', mode)} must return floats, not {wrong[0]}: it must be smooth")
-    return sum(part.size for part in parts)
-
-
 def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> None:
     """Raise `ValueError` unless a function returns an array of floats of a shape."""
     function_name, result = _name(name, mode), _result(form, name, mode)
@@ -280,9 +252,30 @@ def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> 
         raise ValueError(f"{function_name} must return floats, not {result.dtype}: it must be smooth")
 
 
-def _require_pair(form: Form, mode: int, result: object) -> None:
-    """Raise `ValueError` unless a reset returns a state and a whole number."""
-    expected = f"modes[{mode}].reset(t, y) must return (state, number of the next mode)"
+def _check_mode(form: Form, mode: int) -> tuple[int, bool]:
+    """The number of margins of a mode, and whether it has a reset.
+
+    **Raises:** `ValueError` unless the margins are floats, in an array or a dict if several, and a reset returns a state and
+    a whole number.
+    """
+    _require_shape(form, "field", mode, (form.size,))
+    result = _result(form, "margin", mode)
+    if result is None:
+        return 0, False
+    parts = list(result.values()) if isinstance(result, dict) else [result]
+    most = 0 if isinstance(result, dict) else 1
+    if not parts or not all(hasattr(part, "shape") and part.ndim <= most and part.size for part in parts):
+        raise ValueError(
+            f"{_name('margin', mode)} must return one number, an array of shape (k,), a dict of numbers by name, or None, not "
+            f"{described(result)}"
+        )
+    wrong = [part.dtype for part in parts if not jnp.issubdtype(part.dtype, jnp.floating)]
+    if wrong:
+        raise ValueError(f"{_name('margin', mode)} must return floats, not {wrong[0]}: it must be smooth")
+    count, result = sum(part.size for part in parts), _result(form, "reset", mode)
+    if result is None:
+        return count, False
+    expected = f"{_name('reset', mode)} must return (state, number of the next mode)"
     if not isinstance(result, tuple) or len(result) != 2:
         raise ValueError(f"{expected}, not {described(result)}")
     state, number = (jax.eval_shape(lambda part=part: part) if callable(part) else part for part in result)
@@ -290,6 +283,7 @@ def _require_pair(form: Form, mode: int, result: object) -> None:
         raise ValueError(f"{expected}; its state is {described(state)}, not an array of shape ({form.size},)")
     if getattr(number, "shape", None) != () or not jnp.issubdtype(number.dtype, jnp.integer):
         raise ValueError(f"{expected}; its number is {described(number)}, not a whole number")
+    return count, True
 
 
 # The checks of a mechanical system and of a start.

@@ -172,9 +172,35 @@ class _Block(AbstractScalarReader):
             return [self.extreme("lt" if name == "argmin" else "gt", inputs[0], parameters["axes"][0])]
         return super().apply(equation, inputs)
 
+    def kind(self, equation: Equation) -> str:
+        """An elementwise operation: the name of a primitive, or JavaScript."""
+        name, parameters = equation.primitive.name, equation.params
+        types = [atom.aval.dtype for atom in equation.invars]
+        if name == "integer_pow":
+            power = " * ".join(["{0}"] * abs(parameters["y"])) or "1"
+            return power if parameters["y"] >= 0 else f"1 / ({power})"
+        if name == "polynomial":
+            return functools.reduce(
+                lambda terms, k: f"({terms}) * {{0}} + {{{k}}}", range(len(types) - 2, 0, -1), f"{{{len(types) - 1}}}"
+            )
+        if name == "select_n":
+            chain = (f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, len(types)))
+            return CHOICE if types[0] == np.bool_ else "".join(chain) + "NaN"
+        if name == "not":
+            return "!{}" if types[0] == np.bool_ else "~{}"
+        if name == "div" and np.issubdtype(types[0], np.integer):
+            return "Math.trunc({} / {})"
+        if name == "convert_element_type":
+            if parameters["new_dtype"] == np.bool_:
+                return "{} != 0"
+            cut = np.issubdtype(parameters["new_dtype"], np.integer) and np.issubdtype(types[0], np.floating)
+            return "Math.trunc({})" if cut else "+{}" if types[0] == np.bool_ else "{}"
+        if name not in ELEMENTWISE:
+            known = f"use some of {', '.join(sorted(ELEMENTWISE))}"
+            raise ValueError(f"the primitive {name!r} of JAX cannot be written in JavaScript; {known}")
+        return name
+
     def element(self, name: str, *numbers: Number, equation: Equation | None = None) -> Number:
-        if equation is not None:
-            name = _operation(equation)
         if name in KNOWN and not _strings(numbers):
             return KNOWN[name](*numbers)
         if name == "{}":
@@ -279,35 +305,6 @@ class _Block(AbstractScalarReader):
             reads |= inside_reads
         self.statements.append((names, reads, [*lines, "}"]))
         return variables
-
-
-def _operation(equation: Equation) -> str:
-    """An elementwise operation: the name of a primitive, or JavaScript."""
-    name, parameters = equation.primitive.name, equation.params
-    types = [atom.aval.dtype for atom in equation.invars]
-    if name == "integer_pow":
-        power = " * ".join(["{0}"] * abs(parameters["y"])) or "1"
-        return power if parameters["y"] >= 0 else f"1 / ({power})"
-    if name == "polynomial":
-        return functools.reduce(
-            lambda terms, k: f"({terms}) * {{0}} + {{{k}}}", range(len(types) - 2, 0, -1), f"{{{len(types) - 1}}}"
-        )
-    if name == "select_n":
-        chain = (f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, len(types)))
-        return CHOICE if types[0] == np.bool_ else "".join(chain) + "NaN"
-    if name == "not":
-        return "!{}" if types[0] == np.bool_ else "~{}"
-    if name == "div" and np.issubdtype(types[0], np.integer):
-        return "Math.trunc({} / {})"
-    if name == "convert_element_type":
-        if parameters["new_dtype"] == np.bool_:
-            return "{} != 0"
-        cut = np.issubdtype(parameters["new_dtype"], np.integer) and np.issubdtype(types[0], np.floating)
-        return "Math.trunc({})" if cut else "+{}" if types[0] == np.bool_ else "{}"
-    if name not in ELEMENTWISE:
-        known = f"use some of {', '.join(sorted(ELEMENTWISE))}"
-        raise ValueError(f"the primitive {name!r} of JAX cannot be written in JavaScript; {known}")
-    return name
 
 
 def _flat(values: Sequence[Value]) -> list[Number]:
