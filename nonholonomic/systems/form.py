@@ -164,9 +164,10 @@ class Form:
             if name != "reset":
                 return getattr(part, name)(t, y)
             following: Any = part.reset(t, y, *exit_of(part.margin(t, y), exit))
-            # A mechanical system need not name the next mode.
-            is_unnamed = isinstance(part, AbstractFormulation) and following is not None
-            return (*following, mode)[:2] if is_unnamed else following
+            if isinstance(part, AbstractFormulation) and following is not None:
+                # A mechanical system need not name the next mode.
+                return (*following, mode)[:2]
+            return following
 
         return called
 
