@@ -12,7 +12,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -58,7 +58,7 @@ Elements = np.ndarray
 
 
 #: Elements, or an array of JAX with one more axis, of lanes.
-Movable = Any
+Movable = TypeVar("Movable", Elements, Array)
 
 #: For each factor of a product, some of its axes.
 Axes = tuple[Sequence[int], Sequence[int]]

@@ -21,7 +21,6 @@ from ..compilation.components import over_lanes
 from ..compilation.tracing import in_cells
 from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
-from ..hybrid.ensemble import over_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from ..runs.event import UNMEASURED
@@ -215,7 +214,9 @@ class BatchedMode(AbstractBatchedMode):
         An event at the end of the mode comes before the reset. If the reset jumps over the zero of the event function,
         the event happens at the reset, and the run ends between two modes.
         """
-        return over_cells(_after_reset, self)(state, self._exit(stop_gradient(state)))
+        axes = (lambda leaf: -1 if eqx.is_array(leaf) and leaf.ndim else None, -1, -1)
+        reset = eqx.filter_vmap(_after_reset, in_axes=axes, out_axes=-1)
+        return reset(self, state, self._exit(stop_gradient(state)))
 
     def _exit(self, state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
         """The index of the margin that ended the mode: the first of those that are least up to round-off and fall."""

@@ -163,7 +163,7 @@ class Form:
                 return (margin,) if jnp.ndim(margin) == 0 else tuple(margin[k] for k in range(margin.shape[0]))
             if name != "reset":
                 return getattr(part, name)(t, y)
-            following: Any = part.reset(t, y, *exit_of(part.margin(t, y), exit))
+            following = part.reset(t, y, *exit_of(part.margin(t, y), exit))
             if isinstance(part, AbstractFormulation) and following is not None:
                 # A mechanical system need not name the next mode.
                 return (*following, mode)[:2]
