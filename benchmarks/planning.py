@@ -36,9 +36,8 @@ from measure import machine, table, write_csv
 from shortest_paths import dubins, reeds_shepp
 
 import stroller
-from stroller.planning.plan import TIGHT
+from stroller.planning.plan import TIGHT, checked_drive
 from stroller.planning.problem import Problem
-from stroller.planning.result import checked_drive
 from stroller.planning.search import paths_of, prices
 from stroller.planning.transcription import drive_along, interpolate
 

@@ -17,15 +17,16 @@ from nonholonomic.integration.problem import Status as Status
 from nonholonomic.sweeps import Table as Table
 
 from . import presets as presets
+from .friction import AbstractFriction as AbstractFriction
+from .friction import Damping as Damping
+from .friction import Frictionless as Frictionless
+from .friction import RollingResistance as RollingResistance
+from .model.dynamics import Stroller as Stroller
 from .model.input import Motion as Motion
 from .model.input import Steady as Steady
+from .model.scene import Launch as Launch
 from .model.scene import Scene as Scene
-from .model.vehicle import AbstractFriction as AbstractFriction
-from .model.vehicle import Damping as Damping
-from .model.vehicle import Frictionless as Frictionless
-from .model.vehicle import Launch as Launch
-from .model.vehicle import RollingResistance as RollingResistance
-from .model.vehicle import Stroller as Stroller
+from .planning.plan import Plan as Plan
 from .planning.plan import plan as plan
 from .planning.plan import track as track
 from .planning.planner import Planner as Planner
@@ -35,7 +36,6 @@ from .planning.problem import Disc as Disc
 from .planning.problem import Footprint as Footprint
 from .planning.problem import Goal as Goal
 from .planning.problem import Limits as Limits
-from .planning.result import Plan as Plan
 from .runs.model import Recording as Recording
 from .runs.model import identify as identify
 from .runs.model import log_density as log_density

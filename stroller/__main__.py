@@ -21,12 +21,12 @@ from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import as_number, replacing, require, require_folder
 
+from .friction import Damping
+from .model.dynamics import Stroller
 from .model.input import Motion
-from .model.scene import FORKS, Scene
-from .model.vehicle import Damping, Launch, Stroller
-from .planning.plan import plan
+from .model.scene import FORKS, Launch, Scene
+from .planning.plan import Plan, plan, planned_stage
 from .planning.problem import Box, Goal, Limits
-from .planning.result import Plan, planned_stage
 from .runs.model import simulate
 from .runs.trajectory import Trajectory, table_of
 from .runs.view import draw_rides, grouped

@@ -1,4 +1,4 @@
-"""The equations of motion of the stroller in the P-form (`stroller.md`, section 5), without singular angles or
+"""The vehicle, and its equations of motion in the P-form (`stroller.md`, section 5), without singular angles or
 tan(phi).
 
 The state, with vectors in the ground's axes, contains the position r of the rear axle, the heading e, the steering
@@ -14,7 +14,8 @@ the steps. Only the speed of the front wheel depends on the sum, so `righted` co
 the field does not.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,16 +31,142 @@ from nonholonomic.geometry import (
     cross,
     dot,
     multiply,
+    none_if_zero,
     scale,
     stacked,
     subtract,
     sum_vectors,
 )
+from nonholonomic.validation import Bound, Bounded, as_number, largest
 
+from ..friction import AbstractFriction, Drag, WheelMotion
 from .input import Input, Motion
-from .vehicle import AbstractFriction, Drag, Heading, Stroller, WheelMotion
 
 State = Float[Array, "components ..."]
+
+# The body: a rigid frame on two rear wheels, with one front wheel in a fork that steers.
+
+#: A wheelbase above this [m], more than any vehicle's, suggests millimetres or centimetres.
+LONGEST = 20.0
+
+
+class Stroller(Bounded):
+    """A stroller: wheels without mass or width, the steering axis through the front wheel's contact point.
+
+    **Arguments:**
+
+    - `mass`: mass [kg], positive.
+    - `wheelbase`: distance l [m] from the middle of the rear axle to the front contact point, positive.
+    - `inertia`: moment of inertia J [kg m^2] in yaw about the middle of the rear axle, positive.
+    - `steering_inertia`: moment of inertia J_f [kg m^2] of the fork about the steering axis, positive.
+    - `steering_spring`: stiffness [N m/rad] of a spring that pulls the fork straight, at least 0.
+    - `centre`: distance b [m] of the centre of mass ahead of the rear axle, in [0, `wheelbase`], which loads the front
+      wheel. `inertia` must be at least `mass` b^2. The equations hold for b > 0 on a plane.
+
+    **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    Stroller(mass=12 kg, wheelbase=0.7 m, inertia=1.5 kg m², steering_inertia=0.05 kg m²)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2"}
+    units |= {"steering_spring": "N m rad-1", "centre": "m"}
+
+    mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    wheelbase: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    steering_inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    steering_spring: Float[Array, "..."] | None = eqx.field(
+        converter=none_if_zero, default=None, metadata=Bound.NOT_NEGATIVE
+    )
+    centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None, metadata=Bound.NOT_NEGATIVE)
+
+    def suspicion(self) -> str | None:
+        longest = largest(self.wheelbase)
+        if longest <= LONGEST:
+            return None
+        unit, metres = ("mm", longest / 1e3) if longest > 10.0 * LONGEST else ("cm", longest / 1e2)
+        return f"wheelbase = {longest:g} m is long: was it in {unit}? {longest:g} {unit} are {metres:g} m"
+
+    def bounds(self) -> Iterator[Bound]:
+        yield from super().bounds()
+        if self.centre is not None:
+            yield Bound(self.centre, "centre", at_most=self.wheelbase, why="the wheelbase")
+            min_inertia = self.mass * self.centre**2
+            yield Bound(
+                self.inertia, "inertia", at_least=min_inertia, why="mass centre^2, as it is about the rear axle"
+            )
+
+
+# What the constraints allow.
+
+VERTICAL: Vector = (None, None, 1.0)
+
+
+class Heading(eqx.Module):
+    """One of two meanings of "the wheels do not slip sideways" on curved ground; on a plane they are equal.
+
+    In both, the rear axle moves with the velocity w cos(phi) d and the heading turns at the rate w nu sin(phi) / l, where w
+    is the one free speed of the motion. Vectors are in the ground's axes.
+
+    - Intrinsic: the heading is a unit vector e along the ground that turns about the normal: d = e, nu = 1 (section 4).
+    - `projected`: it is a horizontal unit vector h, as in the paper: d = h n_z - z (h.n), nu = n_z (section 3). The velocity
+      along d has the horizontal component n_z h, so the paper's speed is w cos(phi) n_z, which passes through zero at the
+      equator. Where d = 0 the constraints lose rank.
+    """
+
+    projected: bool = eqx.field(static=True)
+
+    def axes(self, ground: AbstractSurface) -> int:
+        """Number of components of the heading that do not vanish identically."""
+        return 2 if self.projected else ground.axes
+
+    def unit(self, heading: Vector, normal: Vector) -> Vector:
+        """The heading, corrected for a drift off the ground or off unit length.
+
+        An exact heading is unchanged, and so is its rate.
+        """
+        if not self.projected:
+            heading = sum_vectors(heading, scale(subtract(None, dot(heading, normal)), normal))
+        return scale(1.0 / jnp.sqrt(dot(heading, heading)), heading)
+
+    def direction(self, heading: Vector, normal: Vector, side: float) -> tuple[Vector, Component, Component]:
+        """The vector d along the ground, its square d.d, and the factor nu, from the outward normal and the side: 1
+        outside, -1 inside."""
+        if not self.projected:
+            return heading, 1.0, 1.0
+        lift = scale(subtract(None, dot(heading, normal)), VERTICAL)
+        direction = scale(side, sum_vectors(scale(normal[2], heading), lift))
+        return direction, dot(direction, direction), multiply(side, normal[2])
+
+    def rate(self, heading: Vector, normal: Vector, normal_rate: Vector, turn: Component, side: float) -> Vector:
+        """Rate [1/s] of a heading that turns at the rate `turn` [rad/s] to the driver's left."""
+        if self.projected:
+            # The driver's left is to the left as seen from above on either side, as in the paper's equations.
+            return cross(scale(turn, VERTICAL), heading)
+        yaw = scale(multiply(side, turn), normal)
+        return cross(sum_vectors(yaw, cross(normal, normal_rate)), heading)
+
+    def at_angle(self, angle: Float[Array, "..."], east: Vector, north: Vector) -> Vector:
+        """The heading at an angle [rad], given the unit vectors of the place."""
+        if self.projected:
+            return (jnp.cos(angle), jnp.sin(angle), None)
+        return sum_vectors(scale(jnp.cos(angle), east), scale(jnp.sin(angle), north))
+
+    def angle(self, heading: Vector, east: Vector, north: Vector) -> Float[Array, "..."]:
+        """The angle [rad] of a heading, in (-pi, pi]."""
+        if self.projected:
+            return jnp.arctan2(heading[1], heading[0])
+        return jnp.arctan2(dot(heading, north), dot(heading, east))
+
+
+# The equations of motion.
 
 
 class Geometry(NamedTuple):

@@ -1,5 +1,6 @@
-"""The scene, vehicle, ground, friction and gravity, and its rides as problems."""
+"""The scene: vehicle, ground, friction and gravity; launches, and rides as problems."""
 
+import math
 from collections.abc import Iterator
 from typing import Any, ClassVar, TypeAlias
 
@@ -13,12 +14,111 @@ from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, Sphere, Torus, stacked
 from nonholonomic.geometry.surface import as_surface
 from nonholonomic.integration import AbstractProblem, Jumps
+from nonholonomic.parameters import as_one
 from nonholonomic.text import is_array, is_users, parted, shown, suspected_gravity
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, largest, require_all, require_kind
+from nonholonomic.validation import (
+    IN_DEGREES,
+    Bound,
+    Bounded,
+    Converted,
+    as_number,
+    is_traced,
+    largest,
+    require_all,
+    require_kind,
+)
 
-from .dynamics import Dynamics, State
+from ..friction import AbstractFriction, Frictionless, as_law
+from .dynamics import Dynamics, Heading, State, Stroller
 from .input import MOST_ELEMENTS, Formula, Input, PerRide, at_start, jump_times
-from .vehicle import AbstractFriction, Frictionless, Heading, Launch, Stroller, as_launch, as_law
+
+# Launches: how a ride starts.
+
+
+def as_numbers(value: Any) -> Any:
+    """A sequence of numbers as a tuple of arrays; anything else stays unchanged, for later checks."""
+    try:
+        return tuple(as_number(number) for number in tuple(value))
+    except TypeError:
+        return value
+
+
+#: Largest usual angles [rad]: a front wheel that turns by half a turn, and a heading after two turns.
+USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
+
+
+def as_place(value: Any) -> tuple[Converted, ...]:
+    """Two or three numbers as a tuple of arrays; raises `ValueError` for anything else."""
+    numbers = as_numbers(value)
+    if not (isinstance(numbers, tuple) and len(numbers) in (2, 3)):
+        raise ValueError(f"place = {shown(numbers)} must be a pair of numbers, or (x, y, z) [m]")
+    return numbers
+
+
+class Angled(Bounded):
+    """A module whose angles may have been given in degrees."""
+
+    def suspicion(self) -> str | None:
+        """The suspicion that an angle, of those that have usual values, is in degrees; `None` if none is. Raises `ValueError`
+        for an angle beyond a turn."""
+        for name, limit in USUAL.items():
+            magnitude = largest(getattr(self, name, None))
+            degrees = IN_DEGREES.format(f"{magnitude:g}")
+            if magnitude > 2.0 * math.pi:
+                raise ValueError(f"{name} = {shown(getattr(self, name))} must be within [-2 pi, 2 pi]{degrees}")
+            if magnitude > limit:
+                return f"{name} = {magnitude:g} rad is large{degrees}"
+        return None
+
+
+#: Speeds above this [m/s] suggest kilometres per hour.
+FASTEST = 60.0
+
+
+class Launch(Angled):
+    """A launch: position of the rear axle, heading, speed and steering.
+
+    **Arguments:**
+
+    - `place`: position on the surface. On a plane, paraboloid or graph, (x, y) [m], which on a tilted plane are
+      measured along the plane. On a sphere or spheroid, azimuth and reduced latitude [rad]. On a torus, azimuth and
+      angle about the tube [rad]. On a cylinder, distance along the axis [m] and angle from the lowest line [rad]. Any
+      surface also accepts (x, y, z) [m] in the fixed frame.
+    - `heading`: angle psi [rad] of the heading from the surface's east towards its north: from x towards y on a plane.
+      The projected heading of the paper is the angle theta [rad] of its horizontal projection from x towards y.
+    - `speed`: speed v [m/s] of the rear axle along the heading, negative in reverse; the horizontal speed where the
+      heading is projected.
+    - `steering`: angle phi [rad] of the front wheel, positive to the driver's left.
+    - `steering_rate`: rate phi' of the steering angle [rad/s].
+
+    **Raises:** `ValueError` for numbers that are not finite, angles beyond 2 pi, or a place that does not have two or three
+    numbers.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    Launch(place=(0, 0) m or rad, heading=0.3 rad, speed=2 m/s, steering=0 rad, steering_rate=0 rad/s)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"place": "m or rad", "heading": "rad", "speed": "m s-1", "steering": "rad"}
+    units |= {"steering_rate": "rad s-1"}
+
+    place: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_place)
+    heading: Float[Array, "..."] = eqx.field(converter=as_number)
+    speed: Float[Array, "..."] = eqx.field(converter=as_number)
+    steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    steering_rate: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+
+    def suspicion(self) -> str | None:
+        fastest = largest(self.speed)
+        if fastest > FASTEST:
+            return f"speed = {fastest:g} m/s is fast: was it in km/h? {fastest:g} km/h are {fastest / 3.6:.4g} m/s"
+        return super().suspicion()
+
 
 # The scene: vehicle, ground, friction and gravity.
 
@@ -170,7 +270,7 @@ class Scene(Bounded):
 
         **Returns:** an array (components, ...) in SI units.
         """
-        launch, dynamics = as_launch(launch), self.dynamics
+        launch, dynamics = as_one(launch, "launch", Launch), self.dynamics
         position, east, north = self.surface.chart(launch.place)
         heading = dynamics.heading.at_angle(launch.heading, east, north)
         _, _, lead = dynamics.heading.direction(heading, self.surface.normal(position), dynamics.side)
@@ -186,7 +286,7 @@ class Scene(Bounded):
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
-        launch, body, dynamics = as_launch(launch), self.body, self.dynamics
+        launch, body, dynamics = as_one(launch, "launch", Launch), self.body, self.dynamics
         one = jnp.ones_like(self.state(launch, driven)[0])
         rate = jnp.sqrt(self.gravity / body.wheelbase) + jnp.abs(launch.steering_rate) + 1e-3
         rate = rate + jnp.abs(launch.speed) / body.wheelbase

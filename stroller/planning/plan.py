@@ -1,7 +1,9 @@
-"""Plan a drive to a goal, and keep a ride on its plan."""
+"""Plan a drive to a goal, check and show the result, and keep a ride on its plan."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,19 +11,33 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.geometry import AbstractSurface, cross, difference, dot, scale
+from nonholonomic.geometry import AbstractSurface, Plane, cross, difference, dot, scale
 from nonholonomic.terminal import status_line
-from nonholonomic.text import shown
-from nonholonomic.validation import require_flag, require_kind, require_whole
-from nonholonomic.views.stage import fixed
+from nonholonomic.text import in_unit, readable_unit, require_unit, shown
+from nonholonomic.validation import require_file, require_flag, require_kind, require_package, require_whole
+from nonholonomic.views import DARK, Body, Mesh, Page, Stage, arena, bar, page
+from nonholonomic.views.plot import new_figure
+from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
-from ..model.dynamics import padded
+from ..model.dynamics import Dynamics, padded
 from ..model.input import Motion
-from ..model.scene import Scene
-from ..model.vehicle import Launch
+from ..model.scene import Launch, Scene
+from ..runs.model import simulate
+from ..runs.trajectory import Trajectory
 from .planner import Planner, proposed
-from .problem import MOST_STEERING, Box, Disc, Footprint, Goal, Limits, Problem, checked_problem
-from .result import ALLOWED, Plan, checked_drive
+from .problem import (
+    MOST_STEERING,
+    Box,
+    Disc,
+    Footprint,
+    Goal,
+    Limits,
+    Points,
+    Problem,
+    checked_problem,
+    corners_of,
+    frame_of,
+)
 from .search import INTERVALS, guess_of, paths_of, prices
 from .transcription import (
     FINE,
@@ -36,6 +52,238 @@ from .transcription import (
     interpolate,
     optimise,
 )
+
+# The result of a plan.
+
+
+class Plan(eqx.Module):
+    """A planned drive, its run at a tolerance of 1e-9, and what the check of this run says.
+
+    - `input`: the input of the drive, an `equinox.Module` that `simulate`, `sweep` and `identify` accept;
+    - `t1`: its duration [s]; `run`: its `Trajectory`;
+    - `reached`: whether the run ends at the goal, keeps all limits, up to 0.001 of their ranges, and touches no obstacle;
+    - `clearance`: least distance [m] of the footprint from an obstacle, negative for an overlap, infinite without
+      obstacles;
+    - `margins`: the distance of the run from each limit, by name, negative where the limit is exceeded;
+    - `effort`: integral over time of F^2 + (torque / wheelbase)^2 [N^2 s];
+    - `errors`: errors of place [m], heading [rad] and speed [m/s] at the end;
+    - `hindrances`: what is wrong with the run, in words; empty if the goal is reached;
+    - `excess`: the same as a number, 0 if the goal is reached, by which attempts are compared;
+    - `candidates`: the paths [m] of all optimised candidates, (candidates, points, 3), in the fixed frame.
+
+    `print` shows the result, `plot` draws it, and `view` writes a page on which it is played.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 0.5, 0.1, 0.05))
+    >>> gap = [stroller.Box((1.1, 0.3), (0.5, 0.25)), stroller.Box((2.7, 0.3), (0.5, 0.25))]
+    >>> start, goal = stroller.Launch((0.7, 0.8), 0.0, 0.0), stroller.Goal((1.8, 0.3), heading=0.0)
+    >>> plan = stroller.plan(scene, start, goal, 12.0, obstacles=gap, limits=stroller.Limits(steering=1.0))
+    >>> print(f"{plan.run.place[-1, 0]:.1f} m, {plan.run.place[-1, 1]:.1f} m")
+    1.8 m, 0.3 m
+
+    ```
+    """
+
+    input: Drive
+    run: Trajectory
+    problem: Problem
+    clearance: float
+    margins: dict[str, float]
+    effort: float
+    errors: tuple[float, float, float]
+    hindrances: tuple[str, ...]
+    excess: float
+    candidates: Float[Array | np.ndarray, "candidates knots 3"]
+
+    @property
+    def t1(self) -> float:
+        return float(self.input.duration)
+
+    @property
+    def reached(self) -> bool:
+        return not self.hindrances
+
+    def __repr__(self) -> str:
+        units = {name: readable_unit(unit) for name, unit in self.problem.limits.units.items()}
+        goal, count = self.problem.goal, len(self.problem.obstacles)
+        obstacles = "1 obstacle" if count == 1 else f"{count} obstacles"
+        place, heading, speed = self.errors
+        turn = "" if goal.heading is None else f"heading {heading:.2g} rad, "
+        lines = [
+            f"Plan of {self.t1:.4g} s: {'reaches the goal' if self.reached else 'does not reach the goal'}",
+            f"  end        place off by {place:.2g} m, {turn}speed {speed:.2g} m/s; allowed {float(goal.within):g}",
+            *([f"  clearance  {self.clearance:.3g} m from {obstacles}"] if count else []),
+            *(f"  {name:9s}  margin {margin:.3g} {units[name]}".rstrip() for name, margin in self.margins.items()),
+            f"  effort     {self.effort:.4g} N² s",
+            f"  grip       {self.run.grip_in_words}",
+            f"  tried      {len(self.candidates)} candidates",
+            *(f"  hindrance  {words}" for words in self.hindrances),
+        ]
+        # A run that failed has no end, and no value of what depends on it.
+        return "\n".join(line for line in lines if " nan " not in line)
+
+    def plot(self, unit: str | Sequence[str] | None = None) -> Any:
+        """Draw the plan from above, or in space on a curved ground: its goal, obstacles, footprint and candidates; and its
+        speed and steering over time (needs matplotlib).
+
+        **Arguments:** `unit`: unit of speed and steering, such as "deg", "km/h", or both.
+
+        **Returns:** a matplotlib figure.
+
+        **Raises:** `ValueError` for an unknown unit.
+        """
+        require_package("matplotlib", "plot", "plot")
+        require_unit(unit)
+        problem, surface, figure = self.problem, self.problem.scene.surface, new_figure(9.0, 4.5)
+        grid, axes = figure.add_gridspec(1, 2, width_ratios=(3, 2)), 2 if isinstance(surface, Plane) else 3
+        above = figure.add_subplot(grid[0], **({"projection": "3d", "elev": 60.0} if axes == 3 else {}))
+        curves = figure.add_subplot(grid[1])
+
+        def draw(points: Points, colour: str, width: float, label: str | None = None, marker: str = "") -> None:
+            above.plot(*np.asarray(points).T[:axes], marker, color=colour, linewidth=width, label=label)
+
+        for line in planned_stage(self).arena.lines if axes == 3 else ():
+            draw(line, "0.7", 0.4)
+        for foot in (outline(surface, obstacle) for obstacle in problem.obstacles):
+            above.fill(*foot.T[:2], color="0.6") if axes == 2 else draw(foot[[*range(len(foot)), 0]], "0.4", 1.5)
+        for line in self.candidates:
+            draw(line, "0.75", 0.7)
+        shown = np.linspace(0, len(self.run.t) - 1, OUTLINES).astype(int)
+        for corners in outlines(problem, problem.footprint, self.run.state[shown, : 2 * surface.axes]):
+            draw(corners[CLOSED], "C0", 0.6)
+        draw(self.run.position, "C0", 1.5, "rear axle")
+        is_cross, target = problem.goal.heading is None, goal_corners(problem)
+        draw(target.mean(axis=0)[None] if is_cross else target[CLOSED], "C2", 1.2, "goal", "x" if is_cross else "")
+        above.grid(False)
+        above.locator_params(nbins=5)
+        above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", **({"zticks": []} if axes == 3 else {}))
+        above.set_title("reaches the goal" if self.reached else "; ".join(self.hindrances), fontsize="small")
+        above.legend(fontsize="small")
+        for name, values, si in (("speed", self.run.speed, "m/s"), ("steering angle", self.run.steering, "rad")):
+            text, factor = in_unit(si, unit)
+            curves.plot(self.run.t, factor * values, label=f"{name} [{text}]")
+        curves.set_xlabel("time [s]")
+        curves.legend(fontsize="small")
+        return figure
+
+    @status_line("drawing")
+    def view(self, path: str | Path | None = None, unit: str | Sequence[str] | None = None) -> Page:
+        """An animated page of the drive, with its obstacles, the footprint, and the candidates as thin lines (needs
+        jupyter-threejs-sage).
+
+        **Arguments:** `path`: file for the page, with a name that ends in .html, or `None`; `unit`: unit of the curves.
+
+        **Returns:** a `Page`, which a notebook shows.
+
+        **Raises:** `ModuleNotFoundError` if jupyter-threejs-sage is not installed, `OSError` if the file cannot be
+        written, `ValueError` for another file type.
+        """
+        require_package("jupyter_threejs_sage", "view", "view")
+        if path is not None:
+            require_file(path, "path", ".html", ".htm")
+        require_unit(unit)
+        (stage,) = curves_in([planned_stage(self)], unit)
+        html_page = page([stage], stage.title, speed=1.0)
+        if path is not None:
+            html_page.save(path)
+        return html_page
+
+
+# The check of a drive: a run at a tight tolerance, the exact clearance of the whole footprint, and every limit.
+
+#: Times of the run, the same for all drives, so that they share their programs.
+TIMES = 2001
+
+#: How many times finer the closest approaches are examined.
+FINER = 10
+
+#: By how much a limit may be exceeded, in units of its range: a drive keeps the speed and the angle of a plan up to small
+#: errors, and a limit may be the very value at its start or goal.
+ALLOWED = 1e-3
+
+
+def checked_drive(problem: Problem, drive: Drive, tolerance: float) -> Plan:
+    """The drive as a plan: its run, what this run achieves, and what stands in the way."""
+    t1, scene, goal, axes = float(drive.duration), problem.scene, problem.goal, problem.scene.surface.axes
+    run = simulate(scene, problem.launch, t1, drive, times=np.linspace(0.0, t1, TIMES), tolerance=tolerance)
+    along = seen_along(scene.dynamics, problem.footprint, drive, run.t, run.state)
+    corners, force, torque = map(np.asarray, along)
+    values = {"steering": run.steering, "speed": run.speed, "force": force, "torque": torque}
+    values["grip"] = run.grip()[:, : len(run.loaded_axles)]
+    ranges, units = problem.limits.ranges(), {name: readable_unit(unit) for name, unit in Limits.units.items()}
+    margins = {
+        name: float(min(np.min(values[name]) - low, high - np.max(values[name])))
+        for name, (low, high) in ranges.items()
+    }
+    clearance, nearest = clearance_of(problem, np.asarray(run.t), corners)
+    away = np.asarray(run.state)[-1, : 2 * axes] - np.asarray(problem.goal_pose)
+    turn = 0.0 if goal.heading is None else 2.0 * np.arcsin(np.minimum(1.0, 0.5 * np.linalg.norm(away[axes:])))
+    errors = float(np.linalg.norm(away[:axes])), float(turn), abs(float(run.speed[-1]) - float(goal.speed))
+    within, length = float(problem.goal.within), float(problem.footprint.length)
+    # What is wrong, each relative to what is allowed, and the words for it.
+    wrong = [
+        (error / within - 1.0, f"the {name} at the end is off by {error:.3g} {unit}")
+        for name, unit, error in zip(("place", "heading", "speed"), ("m", "rad", "m/s"), errors, strict=True)
+    ]
+    wrong.append((-clearance / length, f"the footprint overlaps obstacles[{nearest}] by {-clearance:.3g} m"))
+    for name, (low, high) in ranges.items():
+        excess = -margins[name] / (high - low) - ALLOWED
+        wrong.append((excess, f"the {name} exceeds its limit by {-margins[name]:.3g} {units[name]}".rstrip()))
+    if run.status != "completed":
+        # Where the run has no end, what is unknown there is no reason.
+        last = np.asarray(run.t)[np.isfinite(run.speed)].max(initial=0.0)
+        ended = f"the run ends with the status {run.status!r}, after {last:.4g} s of {float(run.t[-1]):.4g} s"
+        wrong = [(1.0, ended), *(pair for pair in wrong if not np.isnan(pair[0]))]
+    # In single precision, the duration of a drive is rounded.
+    longest = float(np.asarray(problem.t1, drive.duration.dtype))
+    wrong.append((t1 / longest - 1.0, f"the drive takes {t1:.4g} s, longer than t1 = {problem.t1:.4g} s"))
+    hindrances = tuple(words for excess, words in wrong if not excess <= 0.0)
+    excess = float(np.nan_to_num(sum(max(excess, 0.0) for excess, _ in wrong), nan=np.inf))
+    squares = force**2 + (torque / float(problem.scene.body.wheelbase)) ** 2
+    effort = float(np.trapezoid(squares, np.asarray(run.t)))
+    return Plan(drive, run, problem, clearance, margins, effort, errors, hindrances, excess, np.zeros((0, 0, 3)))
+
+
+@eqx.filter_jit
+def seen_along(
+    dynamics: Dynamics,
+    footprint: Footprint,
+    drive: Drive,
+    times: Float[Array, " times"],
+    states: Float[Array, "times n"],
+) -> tuple[Points, Float[Array, " times"], Float[Array, " times"]]:
+    """The corners [m] of the footprint, the force [N] and the torque [N m] of a drive along a run."""
+    corners = corners_of(dynamics, footprint, states.T[: 2 * dynamics.surface.axes])
+    return corners, *drive(times, dynamics.geometry(states.T).motion)
+
+
+def clearance_of(
+    problem: Problem, times: Float[np.ndarray, " times"], corners: Float[np.ndarray, "times 4 2"]
+) -> tuple[float, int]:
+    """The least distance [m] between the footprint and an obstacle, negative for an overlap, and the obstacle's number;
+    infinite without obstacles."""
+    if not problem.obstacles:
+        return np.inf, -1
+    coarse = np.stack([obstacle.distance(corners) for obstacle in problem.obstacles], axis=-1)
+    # Between two times, no corner moves further than this.
+    moved = np.linalg.norm(np.diff(corners, axis=0), axis=-1).max(axis=-1)
+    lower = np.minimum(coarse[:-1], coarse[1:]) - moved[:, None]
+    path = CubicSpline(times, corners)
+    least, nearest = coarse.min(), int(np.argmin(coarse.min(axis=0)))
+    for number, obstacle in enumerate(problem.obstacles):
+        step = np.flatnonzero(lower[:, number] < least)
+        inner = times[step][:, None] + np.diff(times)[step][:, None] * np.arange(1, FINER) / FINER
+        fine = obstacle.distance(path(inner.ravel())).min(initial=np.inf)
+        if fine < least:
+            least, nearest = fine, number
+    return float(least), nearest
+
+
+# Planning.
 
 #: Candidates that are optimised together.
 LANES = 2
@@ -321,3 +569,107 @@ def track(scene: Scene, plan: Plan) -> Tracker:
         slow=SLOW * length,
         side=scene.dynamics.side,
     )
+
+
+# The parts of the pictures of a plan.
+
+#: Heights of drawn obstacles, and radii of drawn lines, in units of the wheelbase.
+HEIGHT, THIN, RAISED = 0.5, 0.008, 0.03
+
+#: Reach of the cross at a goal without a heading, along x and y, in units of the wheelbase.
+CROSS = 0.1
+
+#: Height of the camera in units of its distance along the ground, from which obstacles do not hide the stroller.
+RISE = 1.2
+
+#: Sides of a drawn disc, and outlines of the footprint in a plot.
+SIDES, OUTLINES = 48, 13
+
+#: Colours of obstacles, of candidates, and of the goal.
+STONE, FAINT, GREEN = 0x8A8F98, 0x5B8DB8, 0x1F8A4C
+
+#: The corners of a footprint, and the first one again.
+CLOSED = [0, 1, 2, 3, 0]
+
+#: The identity as a quaternion (x, y, z, w).
+UNTURNED = (0.0, 0.0, 0.0, 1.0)
+
+
+def outline(surface: AbstractSurface, obstacle: Box | Disc) -> Float[np.ndarray, "corners 3"]:
+    """The outline of an obstacle on the ground [m], in the fixed frame."""
+    angle = 2.0 * np.pi * np.arange(SIDES) / SIDES
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    is_box = isinstance(obstacle, Box)
+    corners = obstacle.corners if is_box else np.array(obstacle.centre) + float(obstacle.radius) * unit
+    return fixed(surface, surface.chart((corners[:, 0], corners[:, 1]))[0])
+
+
+def planned_stage(plan: Plan) -> Stage:
+    """The run of a plan on its stage, with obstacles, candidates, footprint and goal."""
+    (stage,) = plan.run.stages()
+    problem, (show, *_) = plan.problem, stage.shows
+    surface, length, count = problem.scene.surface, float(problem.scene.body.wheelbase), len(show.times)
+    feet = [outline(surface, part) for part in problem.obstacles]
+    points = np.concatenate([np.asarray(plan.run.position), *feet])
+    ground = arena(surface, points, stage.arena.normal, 3.0 * length, length)
+    still = [("candidates", [ribbon(line, RAISED * length, THIN * length) for line in plan.candidates])]
+    if feet:
+        still.append(("obstacles", [prism(foot, HEIGHT * length) for foot in feet]))
+    ends = goal_corners(problem, 2.0 * RAISED * length)
+    pairs = (ends[:2], ends[2:]) if problem.goal.heading is None else (ends, np.roll(ends, -1, axis=0))
+    still.append(("goal", [bars(*pairs, 2.0 * THIN * length, GREEN)]))
+    place, turn = np.zeros((count, 3)), np.tile(UNTURNED, (count, 1))
+    bodies = tuple(Body(name, place, turn, tuple(meshes)) for name, meshes in still)
+    vehicle = show.bodies[0]
+    own = problem.footprint.corners(np.zeros(2), np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    # The frame's origin is the middle of the rear axle, above the ground.
+    low = np.concatenate([np.asarray(own), np.full((4, 1), -0.17 * length)], axis=1)
+    edge = bars(low, np.roll(low, -1, axis=0), 1.5 * THIN * length, DARK)
+    footprint = Body("footprint", vehicle.position, vehicle.orientation, (edge,))
+    name = f"plan of {plan.t1:.3g} s"
+    title = f"{name}: {'reaches the goal' if plan.reached else 'does not reach the goal'}"
+    shows = (show._replace(name=name, bodies=(*show.bodies, footprint, *bodies)),)
+    return stage._replace(title=title, arena=ground, shows=shows, rise=RISE)
+
+
+def goal_corners(problem: Problem, raised: float = 0.0) -> Float[np.ndarray, "4 3"]:
+    """The corners [m] of the footprint at the goal, or the ends of a cross at a goal without a heading."""
+    arm = CROSS * problem.scene.body.wheelbase
+    footprint = Footprint(2.0 * arm, 2.0 * arm, arm) if problem.goal.heading is None else problem.footprint
+    return outlines(problem, footprint, problem.goal_pose[None], raised)[0]
+
+
+def outlines(
+    problem: Problem, footprint: Footprint, poses: Float[Array, "poses components"], raised: float = 0.0
+) -> Float[np.ndarray, "poses 4 3"]:
+    """The corners [m] of a footprint on the ground, or above it, in the fixed frame."""
+    dynamics, surface = problem.scene.dynamics, problem.scene.surface
+    flat = footprint.corners(*(fixed(surface, part) for part in frame_of(dynamics, poses.T)))
+    ground = surface.nearest(own(surface, np.moveaxis(np.asarray(flat), -1, 0)))
+    return fixed(surface, ground) + raised * dynamics.side * fixed(surface, surface.normal(ground))
+
+
+def prism(foot: Float[np.ndarray, "corners 3"], height: float) -> Mesh:
+    """An upright prism on its corners on the ground, and a lid of triangles about its middle."""
+    top = np.array(foot)
+    top[:, 2] = foot[:, 2].max() + height
+    columns = np.stack([np.broadcast_to(top.mean(axis=0), top.shape), top, foot], axis=1)
+    closed = np.concatenate([columns, columns[:1]])
+    return Mesh(closed.reshape(-1, 3), of_grid(len(closed), 3), STONE)
+
+
+def bars(starts: Float[np.ndarray, "bars 3"], ends: Float[np.ndarray, "bars 3"], radius: float, colour: int) -> Mesh:
+    """Round bars between pairs of points, as one mesh."""
+    meshes = [bar(tuple(a), tuple(b), radius, colour) for a, b in zip(starts, ends, strict=True)]
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    triangles = [mesh.triangles + k * len(mesh.vertices) for k, mesh in enumerate(meshes)]
+    return Mesh(vertices, np.concatenate(triangles), colour)
+
+
+def ribbon(line: Float[np.ndarray, "points 3"], raised: float, half: float) -> Mesh:
+    """A thin band along a line, above the ground."""
+    along = np.gradient(line, axis=0)
+    across = np.stack([-along[:, 1], along[:, 0], np.zeros(len(line))], axis=-1)
+    across *= half / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+    above = line + np.array([0.0, 0.0, raised])
+    return Mesh(np.stack([above - across, above + across], axis=1).reshape(-1, 3), of_grid(len(line), 2), FAINT)

@@ -26,8 +26,7 @@ from nonholonomic.validation import (
 )
 
 from ..model.dynamics import Dynamics, padded
-from ..model.scene import Scene
-from ..model.vehicle import Angled, Launch, as_numbers, as_place
+from ..model.scene import Angled, Launch, Scene, as_numbers, as_place
 
 #: Numbers, and points (..., points, 2), in NumPy or in JAX.
 Numbers: TypeAlias = Float[Array | np.ndarray, "..."]

@@ -39,9 +39,10 @@ from nonholonomic.terminal import status_line
 from nonholonomic.text import name_of, shown
 from nonholonomic.validation import all_bounds, legal, require_kind, require_outside, require_scalars
 
+from ..friction import Damping, RollingResistance
+from ..model.dynamics import Stroller
 from ..model.input import Formula, Input, PerRide, Steady, as_jumps, at_start, check_input
-from ..model.scene import RideProblem, Scene, as_module, has_arrays
-from ..model.vehicle import USUAL, Damping, Launch, RollingResistance, Stroller
+from ..model.scene import USUAL, Launch, RideProblem, Scene, as_module, has_arrays
 from .trajectory import QUANTITIES, TIMED, VECTORS, RideState, Trajectory, heading, ride
 
 #: Names of the coordinates of a place in the fixed frame.

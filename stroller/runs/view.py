@@ -31,8 +31,7 @@ from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
 from ..model.dynamics import State
 from ..model.input import Input
-from ..model.scene import DRIVES, RideProblem, Scene
-from ..model.vehicle import Launch
+from ..model.scene import DRIVES, Launch, RideProblem, Scene
 from .model import RideModel, check_run
 from .trajectory import MOST_GRIP, QUANTITIES, RideState, Trajectory, names_of
 

@@ -18,9 +18,9 @@ import nonholonomic
 import stroller
 from stroller import __main__ as job
 from stroller.planning import planner as planner_module
+from stroller.planning.plan import TIMES, planned_stage, seen_along
 from stroller.planning.planner import proposed
 from stroller.planning.problem import Obstacles, checked_problem, disc_distance, separation
-from stroller.planning.result import TIMES, planned_stage, seen_along
 from stroller.planning.search import Costs, Ground, Search, Steps, paths_of, prices
 from stroller.planning.transcription import Rates, Task, actuation, drive_along, evaluate, interpolate
 
