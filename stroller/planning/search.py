@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from .problem import FAR, Footprint, Numbers, Obstacles, Problem
+from .problem import FAR, Numbers, Obstacles, Problem
 from .transcription import LIMIT_RESERVE, ORDER
 
 # The region of a search, and what the stroller may do there.
@@ -69,123 +69,6 @@ class Costs(NamedTuple):
     clearance: float
 
 
-class Ground(NamedTuple):
-    """The region of a search: lower corner and size (2,) [m], side of a cell [m], cells in each direction, and what must not
-    be touched."""
-
-    low: Float[np.ndarray, " 2"]
-    size: Float[np.ndarray, " 2"]
-    cell: float
-    shape: tuple[int, int]
-    obstacles: Obstacles
-    footprint: Footprint
-
-    @classmethod
-    def of(
-        cls, poses: Float[np.ndarray, "poses 3"], obstacles: Obstacles, footprint: Footprint, radius: float
-    ) -> "Ground":
-        """A region around the start, the goal and all obstacles, with space to turn with the least `radius` [m]."""
-        # NumPy would otherwise dispatch every operation with these to JAX.
-        obstacles, footprint = jax.tree.map(np.asarray, (obstacles, footprint))
-        boxes, centres, radii = obstacles.boxes.reshape(-1, 2), obstacles.centres, obstacles.radii[:, None]
-        points = np.concatenate([boxes, centres - radii, centres + radii])
-        points = np.concatenate([poses[:, :2], points[np.abs(points).max(axis=1) < 0.1 * FAR]])
-        reach = max(2.5 * float(footprint.length), TURNING_SPACE * radius)
-        low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
-        cell = max(0.2 * float(footprint.length), float((high - low).max()) / MOST_CELLS)
-        nx, ny = np.ceil((high - low) / cell).astype(int) + 1
-        return cls(low, high - low, cell, (int(nx), int(ny)), obstacles, footprint)
-
-    def places(self, points: Float[np.ndarray, "*n 2"]) -> tuple[Int[np.ndarray, "*n"], Int[np.ndarray, "*n"]]:
-        """The cells of points, in x and y."""
-        x, y = np.moveaxis(((points - self.low) / self.cell).astype(int), -1, 0)
-        return x.clip(0, self.shape[0] - 1), y.clip(0, self.shape[1] - 1)
-
-    def cells(self, poses: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-        """The numbers of the cells of places, headings and directions of travel."""
-        x, y = self.places(poses[:, :2])
-        heading = np.floor(poses[:, 2] / (2.0 * np.pi) * HEADINGS + 0.5).astype(int) % HEADINGS
-        return ((x * self.shape[1] + y) * HEADINGS + heading) * 2 + (direction > 0.0)
-
-    def is_free(self, poses: Float[np.ndarray, "*n 3"], clearance: float) -> Bool[np.ndarray, "*n"]:
-        """Whether the footprint is inside the region and keeps its distance from all obstacles."""
-        place = poses[..., :2] - self.low
-        free = np.all((place >= 0.0) & (place <= self.size), axis=-1)
-        forward = np.stack([np.cos(poses[..., 2]), np.sin(poses[..., 2])], axis=-1)
-        length = float(self.footprint.length)
-        centre = poses[..., :2] + (length / 2.0 - float(self.footprint.rear)) * forward
-        # Only where the circle about the footprint may touch an obstacle, its corners are looked at.
-        close = self.distance(centre) < 0.5 * np.hypot(length, float(self.footprint.width)) + clearance
-        forward = forward[close]
-        left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
-        corners = self.footprint.corners(poses[close][:, :2], forward, left)
-        free[close] &= self.obstacles.gaps(corners).min(axis=-1, initial=np.inf) > clearance
-        return free
-
-    def distance(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """A lower bound [m] of the distance of points from all obstacles, exact outside of them."""
-        boxes = self.obstacles.boxes
-        side = boxes[:, 0] - boxes[:, 3]
-        length, width = np.linalg.norm(side, axis=-1), np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=-1)
-        axis, away = side / length[:, None], points[..., None, :] - boxes.mean(axis=1)
-        along = np.abs((away * axis).sum(-1)) - length / 2.0
-        across = np.abs(away[..., 1] * axis[:, 0] - away[..., 0] * axis[:, 1]) - width / 2.0
-        gaps = np.hypot(along.clip(0.0), across.clip(0.0))
-        discs = np.linalg.norm(points[..., None, :] - self.obstacles.centres, axis=-1) - self.obstacles.radii
-        return np.concatenate([gaps, discs], axis=-1).min(axis=-1, initial=np.inf)
-
-    def way_to(self, place: Float[np.ndarray, " 2"], clearance: float) -> Float[np.ndarray, "x y"]:
-        """Length [m] of the shortest way of a disc as wide as the vehicle from every cell to a place; infinite if there is
-        none."""
-        nx, ny = self.shape
-        points = self.low + self.cell * (np.moveaxis(np.indices((nx, ny)), 0, -1) + 0.5)
-        half = 0.5 * float(self.footprint.width) + clearance
-        free = self.distance(points) > half - 0.7 * self.cell
-        number = np.arange(nx * ny).reshape(nx, ny)
-        links = []
-        for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
-            here = (slice(0, nx - dx), slice(max(0, -dy), ny - max(0, dy)))
-            there = (slice(dx, nx), slice(max(0, dy), ny + min(0, dy)))
-            both = free[here] & free[there]
-            links.append([number[here][both], number[there][both], np.full(both.sum(), self.cell * np.hypot(dx, dy))])
-        starts, ends, lengths = map(np.concatenate, zip(*links, strict=True))
-        graph = scipy.sparse.csr_array((lengths, (starts, ends)), shape=(nx * ny, nx * ny))
-        return scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=number[self.places(place)]).reshape(nx, ny)
-
-
-class Steps(NamedTuple):
-    """What the stroller may do: least and greatest curvature [1/m], and the directions of travel (1 or -1)."""
-
-    least: float
-    greatest: float
-    directions: tuple[float, ...]
-
-    @classmethod
-    def of(cls, problem: Problem, share: float) -> "Steps":
-        """What the limits of speed and steering angle, of whose curvature only a share is used, allow a search."""
-        angles = problem.limits.arrays(LIMIT_RESERVE)
-        low, high = (float(np.tan(angle[0])) / float(problem.scene.body.wheelbase) for angle in angles)
-        slowest, fastest = problem.limits.ranges().get("speed", (-np.inf, np.inf))
-        directions = tuple(sign for sign, speed in ((1.0, fastest), (-1.0, -slowest)) if speed > 0.0)
-        return cls(max(low, share * low), min(high, share * high), directions)
-
-    @property
-    def sharpest(self) -> float:
-        """The greatest curvature [1/m] to either side."""
-        return max(-self.least, self.greatest)
-
-    def arcs(self, cell: float) -> Float[np.ndarray, "arcs 3"]:
-        """The arcs of a step in a grid with cells of a size [m]: direction of travel, curvature and length.
-
-        A curve that turns by less than a heading of the grid would end in the cell of a cheaper one, and the search would not
-        turn.
-        """
-        bends = np.unique(np.clip(self.sharpest * np.array(CURVATURES), self.least, self.greatest))
-        length = np.minimum(1.5 * cell, MOST_TURN / np.maximum(np.abs(bends), 1e-9))
-        length = np.maximum(length, MOST_TURN / self.sharpest * (bends != 0.0))
-        return np.array([[sign, k, s] for sign in self.directions for k, s in zip(bends, length, strict=True)])
-
-
 def driven(
     poses: Float[np.ndarray, "*n 3"], direction: Numbers, curvature: Numbers, length: Numbers
 ) -> Float[np.ndarray, "*n 3"]:
@@ -197,85 +80,73 @@ def driven(
     return poses + np.stack(np.broadcast_arrays(*changes), axis=-1)
 
 
-def shortcuts(
-    poses: Float[np.ndarray, "poses 3"], goal: np.ndarray, has_heading: bool, steps: Steps
-) -> Float[np.ndarray, "3 3 ways poses"]:
-    """Ways without obstacles: direction, curvature and length of three pieces each; a length is NaN where there is no such way.
-
-    A way consists of two arcs as tight as possible, with a straight piece or a third such arc between them, each forwards or in
-    reverse; the shortest way forwards is among them (Dubins, Am. J. Math. 79 (1957) 497). To a goal without a heading, the last
-    arc has the radius 0.
-    """
-    radii, either = [1.0 / bend for bend in (steps.least, steps.greatest) if bend], steps.directions
-    x, y, heading = poses.T
-    # The directions to try, the radii and the turns of the pieces, and the length of the middle piece where it is straight.
-    ways = []
-    for first, last in product(radii, radii if has_heading else [0.0]):
-        # The line between the circles' centres determines the headings between the pieces.
-        along = goal[0] - last * np.sin(goal[2]) - x + first * np.sin(heading)
-        across = goal[1] + last * np.cos(goal[2]) - y - first * np.cos(heading)
-        away, angle = np.hypot(along, across), np.arctan2(across, along)
-        for sign in either if steps.least <= 0.0 <= steps.greatest else ():
-            straight = np.sqrt(away**2 - (last - first) ** 2)
-            turned = angle - np.arctan2(last - first, sign * straight)
-            turns = (turned - heading, 0.0, goal[2] - turned)
-            ways.append(((either, (sign,), either), (first, 0.0, last), turns, straight))
-        for middle, side in product(radii, (1.0, -1.0)):
-            if middle * first < 0.0 and last in (first, 0.0):
-                a, b = middle - first, last - middle
-                bend = side * np.arccos((away**2 - a**2 - b**2) / (2.0 * a * b))
-                turned = angle - np.arctan2(a * np.cos(bend) + b, -a * np.sin(bend))
-                turns = (turned + bend - heading, -bend, goal[2] - turned)
-                ways.append(((either,) * 3, (first, middle, last), turns, 0.0))
-
-    def piece(sign: float, radius: float, turn: Numbers | float, straight: Numbers | float) -> list[np.ndarray]:
-        arc = (np.mod(sign * np.sign(radius) * turn + TIE, 2.0 * np.pi) - TIE).clip(0.0)
-        return list(np.broadcast_arrays(sign, 1.0 / radius if radius else 0.0, abs(radius) * arc + straight + 0.0 * x))
-
-    pieces = [
-        list(map(piece, signs, of_pieces, turns, (0.0, straight, 0.0)))
-        for options, of_pieces, turns, straight in ways
-        for signs in product(*options)
-    ]
-    return np.array(pieces).reshape(len(pieces), 3, 3, len(poses)).transpose(1, 2, 0, 3)
-
-
 #: A node of a search: its pose (3,), its cost [m], the number of its parent, and the move (3,) that led from there: a direction
 #: of travel, a curvature and a length.
 NODE = np.dtype([("pose", float, 3), ("cost", float), ("parent", int), ("move", float, 3)])
 
 
 class Search:
-    """A search for the cheapest path from one pose (3,) to another.
+    """A search for the cheapest path from the start to the goal on the map of a problem.
 
+    - `low`, `size`: lower corner and size (2,) [m] of the region; `cell`: side of a cell [m]; `shape`: cells in each direction;
+    - `obstacles`, `footprint`: what must not be touched, and by what; `costs`: what is minimised;
+    - `least`, `greatest`, `sharpest`: least and greatest curvature, and the greatest to either side [1/m]; `directions` of
+      travel (1 or -1);
+    - `moves`: the arcs of a step (arcs, 3): direction of travel, curvature and length; `first_moves`: those from the start;
+    - `way`: the length [m] of the shortest way to the goal from every cell (see `way_to`);
     - `tree`: all nodes, of which the first is the start, and their number `count`; `best`: the least cost in each cell;
-    - `path`, `least`: the cheapest path that a shortcut has completed, and its cost [m];
+    - `path`, `price_of_path`: the cheapest path that a shortcut has completed, and its cost [m];
     - `nearest`: distance [m] from the goal to the nearest place of a node.
     """
 
-    def __init__(
-        self, ground: Ground, start: np.ndarray, goal: np.ndarray, has_heading: bool, steps: Steps, costs: Costs
-    ):
-        self.ground, self.goal, self.has_heading, self.steps, self.costs = ground, goal, has_heading, steps, costs
-        arcs = steps.arcs(ground.cell)
+    def __init__(self, problem: Problem, share: float, costs: Costs):
+        """**Arguments:** `share`: share of the curvatures, which the limits of the steering angle allow, that is used."""
+        self.costs, self.has_heading = costs, problem.goal.heading is not None
+        start, self.goal = problem.point(problem.start_pose), problem.point(problem.goal_pose)
+        # NumPy would otherwise dispatch every operation with these to JAX.
+        obstacles, footprint = jax.tree.map(np.asarray, (Obstacles.of(problem.obstacles), problem.footprint))
+        self.obstacles, self.footprint = obstacles, footprint
+        angles = problem.limits.arrays(LIMIT_RESERVE)
+        low, high = (float(np.tan(angle[0])) / float(problem.scene.body.wheelbase) for angle in angles)
+        self.least, self.greatest = max(low, share * low), min(high, share * high)
+        self.sharpest = max(-self.least, self.greatest)
+        slowest, fastest = problem.limits.ranges().get("speed", (-np.inf, np.inf))
+        self.directions = tuple(sign for sign, speed in ((1.0, fastest), (-1.0, -slowest)) if speed > 0.0)
+        # A region around the start, the goal and all obstacles, with space to turn, which is the same for all shares.
+        boxes, centres, radii = obstacles.boxes.reshape(-1, 2), obstacles.centres, obstacles.radii[:, None]
+        points = np.concatenate([boxes, centres - radii, centres + radii])
+        points = np.concatenate([[start[:2], self.goal[:2]], points[np.abs(points).max(axis=1) < 0.1 * FAR]])
+        radius = 1.0 / (min(SEARCH_CURVATURES) * max(-low, high))
+        reach = max(2.5 * float(footprint.length), TURNING_SPACE * radius)
+        self.low = points.min(axis=0) - reach
+        self.size = points.max(axis=0) + reach - self.low
+        self.cell = max(0.2 * float(footprint.length), float(self.size.max()) / MOST_CELLS)
+        nx, ny = np.ceil(self.size / self.cell).astype(int) + 1
+        self.shape = (int(nx), int(ny))
+        # A curve that turns by less than a heading of the grid would end in the cell of a cheaper one, and the search would
+        # not turn.
+        bends = np.unique(np.clip(self.sharpest * np.array(CURVATURES), self.least, self.greatest))
+        length = np.minimum(1.5 * self.cell, MOST_TURN / np.maximum(np.abs(bends), 1e-9))
+        length = np.maximum(length, MOST_TURN / self.sharpest * (bends != 0.0))
+        self.moves = np.array([[sign, k, s] for sign in self.directions for k, s in zip(bends, length, strict=True)])
         # A path with more pieces than a shortcut begins with an arc of any length, and one with fewer with none.
-        self.first_moves = np.concatenate([arcs * [1.0, 1.0, times] for times in range(FIRST_ARCS)])
-        self.moves, self.way = arcs, ground.way_to(goal[:2], costs.clearance)
-        most = MOST_NODES + max(BATCH * len(arcs), len(self.first_moves))
+        self.first_moves = np.concatenate([self.moves * [1.0, 1.0, times] for times in range(FIRST_ARCS)])
+        self.way = self.way_to(self.goal[:2])
+        most = MOST_NODES + max(BATCH * len(self.moves), len(self.first_moves))
         self.tree, self.count = np.zeros(most, NODE), 1
         self.tree["pose"][0] = start
-        self.best = np.full(np.prod(ground.shape) * HEADINGS * 2, np.inf)
-        self.path, self.least = None, np.inf
-        self.nearest = float(np.linalg.norm(start[:2] - goal[:2]))
+        self.best = np.full(np.prod(self.shape) * HEADINGS * 2, np.inf)
+        self.path, self.price_of_path = None, np.inf
+        self.nearest = float(np.linalg.norm(start[:2] - self.goal[:2]))
 
     @np.errstate(invalid="ignore")
     def run(self) -> tuple[Path | None, float, bool]:
         """The cheapest path that the search finds, or `None`; the distance [m] from the goal to the nearest place it came
         to; and whether it has looked everywhere."""
-        frontier, tree, ground = [(0.0, 0)], self.tree, self.ground
-        while frontier and frontier[0][0] < self.least - TIE and self.count < MOST_NODES:
+        frontier, tree = [(0.0, 0)], self.tree
+        while frontier and frontier[0][0] < self.price_of_path - TIE and self.count < MOST_NODES:
             nodes = np.array([heapq.heappop(frontier)[1] for _ in range(min(BATCH, len(frontier)))])
-            cells = ground.cells(tree["pose"][nodes], tree["move"][nodes, 0])
+            cells = self.cells(tree["pose"][nodes], tree["move"][nodes, 0])
             # A cheaper node of the same cell has replaced the others. The start has no cell.
             nodes = nodes[(nodes == 0) | (tree["cost"][nodes] <= self.best[cells] + TIE)]
             if not nodes.size:
@@ -285,11 +156,11 @@ class Search:
             away = np.linalg.norm(poses[:, :2] - self.goal[:2], axis=-1)
             turn = np.abs((poses[:, 2] - self.goal[2] + np.pi) % (2.0 * np.pi) - np.pi) * self.has_heading
             self.nearest = float(away.min(initial=self.nearest))
-            arrived = (away < ARRIVAL[0] * ground.cell) & (turn < ARRIVAL[1] * 2.0 * np.pi / HEADINGS)
+            arrived = (away < ARRIVAL[0] * self.cell) & (turn < ARRIVAL[1] * 2.0 * np.pi / HEADINGS)
             if arrived.any():
-                missing = cost + away + turn / self.steps.sharpest
+                missing = cost + away + turn / self.sharpest
                 return self.path_by(int(numbers[arrived][np.argmin(missing[arrived])]), np.zeros((0, 3))), 0.0, True
-            ahead = np.maximum(self.way[ground.places(poses[:, :2])], self.cut_short(children, numbers))
+            ahead = np.maximum(self.way[self.places(poses[:, :2])], self.cut_short(children, numbers))
             for entry in zip((cost + ahead).tolist(), numbers.tolist(), strict=True):
                 heapq.heappush(frontier, entry)
         return self.path, self.nearest, not frontier
@@ -297,27 +168,71 @@ class Search:
     def expanded(self, nodes: Int[np.ndarray, " nodes"]) -> tuple[np.ndarray, Int[np.ndarray, " children"]]:
         """The new nodes at the ends of all moves from some nodes: those that touch no obstacle, have a way to the goal, and
         are the cheapest in their cells; and their numbers in the tree."""
-        ground, tree, moves = self.ground, self.tree, self.first_moves if nodes[0] == 0 else self.moves
+        tree, moves = self.tree, self.first_moves if nodes[0] == 0 else self.moves
         parent, move = np.repeat(nodes, len(moves)), np.tile(moves, (len(nodes), 1))
         poses = self.along(tree["pose"][parent], move)
         children = np.zeros(len(parent), NODE)
         children["pose"], children["parent"], children["move"] = poses[:, -1], parent, move
         children["cost"] = tree["cost"][parent] + self.price(tree["move"][parent].T, move.T)
-        children = children[np.asarray(ground.is_free(poses, self.costs.clearance).all(axis=1))]
-        cells = ground.cells(children["pose"], children["move"][:, 0])
+        children = children[np.asarray(self.is_free(poses).all(axis=1))]
+        cells = self.cells(children["pose"], children["move"][:, 0])
         order = np.lexsort((children["cost"], cells))
         kept = order[np.unique(cells[order], return_index=True)[1]]
-        has_way = np.isfinite(self.way[ground.places(children["pose"][kept, :2])])
+        has_way = np.isfinite(self.way[self.places(children["pose"][kept, :2])])
         kept = kept[(children["cost"][kept] < self.best[cells[kept]] - TIE) & has_way]
         children, numbers = children[kept], np.arange(self.count, self.count + len(kept))
         self.best[cells[kept]], tree[numbers] = children["cost"], children
         self.count += len(kept)
         return children, numbers
 
+    def shortcuts(self, poses: Float[np.ndarray, "poses 3"]) -> Float[np.ndarray, "3 3 ways poses"]:
+        """Ways to the goal without obstacles: direction, curvature and length of three pieces each; a length is NaN where there
+        is no such way.
+
+        A way consists of two arcs as tight as possible, with a straight piece or a third such arc between them, each forwards
+        or in reverse; the shortest way forwards is among them (Dubins, Am. J. Math. 79 (1957) 497). To a goal without a
+        heading, the last arc has the radius 0.
+        """
+        goal, either = self.goal, self.directions
+        radii = [1.0 / bend for bend in (self.least, self.greatest) if bend]
+        x, y, heading = poses.T
+        # The directions to try, the radii and the turns of the pieces, and the length of the middle piece where it is straight.
+        ways = []
+        for first, last in product(radii, radii if self.has_heading else [0.0]):
+            # The line between the circles' centres determines the headings between the pieces.
+            along = goal[0] - last * np.sin(goal[2]) - x + first * np.sin(heading)
+            across = goal[1] + last * np.cos(goal[2]) - y - first * np.cos(heading)
+            away, angle = np.hypot(along, across), np.arctan2(across, along)
+            for sign in either if self.least <= 0.0 <= self.greatest else ():
+                straight = np.sqrt(away**2 - (last - first) ** 2)
+                turned = angle - np.arctan2(last - first, sign * straight)
+                turns = (turned - heading, 0.0, goal[2] - turned)
+                ways.append(((either, (sign,), either), (first, 0.0, last), turns, straight))
+            for middle, side in product(radii, (1.0, -1.0)):
+                if middle * first < 0.0 and last in (first, 0.0):
+                    a, b = middle - first, last - middle
+                    bend = side * np.arccos((away**2 - a**2 - b**2) / (2.0 * a * b))
+                    turned = angle - np.arctan2(a * np.cos(bend) + b, -a * np.sin(bend))
+                    turns = (turned + bend - heading, -bend, goal[2] - turned)
+                    ways.append(((either,) * 3, (first, middle, last), turns, 0.0))
+
+        def piece(sign: float, radius: float, turn: Numbers | float, straight: Numbers | float) -> list[np.ndarray]:
+            arc = (np.mod(sign * np.sign(radius) * turn + TIE, 2.0 * np.pi) - TIE).clip(0.0)
+            return list(
+                np.broadcast_arrays(sign, 1.0 / radius if radius else 0.0, abs(radius) * arc + straight + 0.0 * x)
+            )
+
+        pieces = [
+            list(map(piece, signs, of_pieces, turns, (0.0, straight, 0.0)))
+            for options, of_pieces, turns, straight in ways
+            for signs in product(*options)
+        ]
+        return np.array(pieces).reshape(len(pieces), 3, 3, len(poses)).transpose(1, 2, 0, 3)
+
     def cut_short(self, children: np.ndarray, numbers: Int[np.ndarray, " children"]) -> Float[np.ndarray, " children"]:
         """Look for a cheaper path to the goal by shortcuts from new nodes, and return the least price [m] of a shortcut from
         each, 0 where there is none."""
-        ways = shortcuts(children["pose"], self.goal, self.has_heading, self.steps)
+        ways = self.shortcuts(children["pose"])
         price, before = np.zeros(ways.shape[2:]), children["move"].T[:, None]
         for move in ways:
             price += self.price(before, move)
@@ -326,26 +241,26 @@ class Search:
         total = children["cost"] + price
         for number in np.argsort(total, axis=None)[:EXAMINED]:
             which, child = np.unravel_index(number, total.shape)
-            if total[which, child] >= self.least:
+            if total[which, child] >= self.price_of_path:
                 break
             whole = self.path_by(int(numbers[child]), ways[..., which, child])
             poses = self.along(whole.poses[:-1], np.stack(whole[1:], axis=1))
-            if self.ground.is_free(poses, self.costs.clearance).all():
-                self.path, self.least = whole, total[which, child]
+            if self.is_free(poses).all():
+                self.path, self.price_of_path = whole, total[which, child]
         shortest = price.min(axis=0, initial=np.inf)
         return np.where(np.isfinite(shortest), shortest, 0.0)
 
     def price(self, before: np.ndarray, move: np.ndarray) -> np.ndarray:
         """The price [m] of a move after another one; each is a direction, 0 for none, a curvature and a length."""
-        (direction, bend, length), costs, sharpest = move, self.costs, self.steps.sharpest
+        (direction, bend, length), costs, sharpest = move, self.costs, self.sharpest
         change = costs.reversal * (before[0] * direction < 0.0)
-        change = change + 0.5 * costs.turning * self.ground.cell * np.abs(before[1] - bend) / sharpest
+        change = change + 0.5 * costs.turning * self.cell * np.abs(before[1] - bend) / sharpest
         factor = np.where(direction < 0.0, costs.backwards, 1.0) * (1.0 + costs.turning * np.abs(bend) / sharpest)
         return length * factor + change * (length > TIE)
 
     def along(self, pose: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, "moves samples 3"]:
         """Poses along moves, each from a pose of its own."""
-        count = max(SAMPLES, int(np.ceil(SAMPLES * moves[:, 2].max() / (1.5 * self.ground.cell))))
+        count = max(SAMPLES, int(np.ceil(SAMPLES * moves[:, 2].max() / (1.5 * self.cell))))
         direction, bend, length = moves.T[..., None]
         return driven(pose[:, None], direction, bend, length * np.arange(1, count + 1) / count)
 
@@ -360,6 +275,62 @@ class Search:
         for piece in moves[len(branch) - 1 :]:
             poses.append(driven(poses[-1], *piece))
         return Path(np.array(poses), *moves.T)
+
+    def places(self, points: Float[np.ndarray, "*n 2"]) -> tuple[Int[np.ndarray, "*n"], Int[np.ndarray, "*n"]]:
+        """The cells of points, in x and y."""
+        x, y = np.moveaxis(((points - self.low) / self.cell).astype(int), -1, 0)
+        return x.clip(0, self.shape[0] - 1), y.clip(0, self.shape[1] - 1)
+
+    def cells(self, poses: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+        """The numbers of the cells of places, headings and directions of travel."""
+        x, y = self.places(poses[:, :2])
+        heading = np.floor(poses[:, 2] / (2.0 * np.pi) * HEADINGS + 0.5).astype(int) % HEADINGS
+        return ((x * self.shape[1] + y) * HEADINGS + heading) * 2 + (direction > 0.0)
+
+    def is_free(self, poses: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
+        """Whether the footprint is inside the region and keeps its distance from all obstacles."""
+        place = poses[..., :2] - self.low
+        free = np.all((place >= 0.0) & (place <= self.size), axis=-1)
+        forward = np.stack([np.cos(poses[..., 2]), np.sin(poses[..., 2])], axis=-1)
+        length = float(self.footprint.length)
+        centre = poses[..., :2] + (length / 2.0 - float(self.footprint.rear)) * forward
+        # Only where the circle about the footprint may touch an obstacle, its corners are looked at.
+        close = self.distance(centre) < 0.5 * np.hypot(length, float(self.footprint.width)) + self.costs.clearance
+        forward = forward[close]
+        left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
+        corners = self.footprint.corners(poses[close][:, :2], forward, left)
+        free[close] &= self.obstacles.gaps(corners).min(axis=-1, initial=np.inf) > self.costs.clearance
+        return free
+
+    def distance(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """A lower bound [m] of the distance of points from all obstacles, exact outside of them."""
+        boxes = self.obstacles.boxes
+        side = boxes[:, 0] - boxes[:, 3]
+        length, width = np.linalg.norm(side, axis=-1), np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=-1)
+        axis, away = side / length[:, None], points[..., None, :] - boxes.mean(axis=1)
+        along = np.abs((away * axis).sum(-1)) - length / 2.0
+        across = np.abs(away[..., 1] * axis[:, 0] - away[..., 0] * axis[:, 1]) - width / 2.0
+        gaps = np.hypot(along.clip(0.0), across.clip(0.0))
+        discs = np.linalg.norm(points[..., None, :] - self.obstacles.centres, axis=-1) - self.obstacles.radii
+        return np.concatenate([gaps, discs], axis=-1).min(axis=-1, initial=np.inf)
+
+    def way_to(self, place: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "x y"]:
+        """Length [m] of the shortest way of a disc as wide as the vehicle from every cell to a place; infinite if there is
+        none."""
+        nx, ny = self.shape
+        points = self.low + self.cell * (np.moveaxis(np.indices((nx, ny)), 0, -1) + 0.5)
+        half = 0.5 * float(self.footprint.width) + self.costs.clearance
+        free = self.distance(points) > half - 0.7 * self.cell
+        number = np.arange(nx * ny).reshape(nx, ny)
+        links = []
+        for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            here = (slice(0, nx - dx), slice(max(0, -dy), ny - max(0, dy)))
+            there = (slice(dx, nx), slice(max(0, dy), ny + min(0, dy)))
+            both = free[here] & free[there]
+            links.append([number[here][both], number[there][both], np.full(both.sum(), self.cell * np.hypot(dx, dy))])
+        starts, ends, lengths = map(np.concatenate, zip(*links, strict=True))
+        graph = scipy.sparse.csr_array((lengths, (starts, ends)), shape=(nx * ny, nx * ny))
+        return scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=number[self.places(place)]).reshape(nx, ny)
 
 
 # The candidates of a plan: paths from searches at different prices, driven within the given time, as first guesses.
@@ -404,13 +375,7 @@ def paths_of(problem: Problem, costs: list[Costs]) -> tuple[list[Path], str | No
     """A path for each of several prices, straight to the goal where the search finds none; and a reason, in words, why
     none can be driven in time, if there is one."""
     start, goal = problem.point(problem.start_pose), problem.point(problem.goal_pose)
-    radius = 1.0 / Steps.of(problem, min(SEARCH_CURVATURES)).sharpest
-    ground = Ground.of(np.stack([start, goal]), Obstacles.of(problem.obstacles), problem.footprint, radius)
-    has_heading = problem.goal.heading is not None
-    results = [
-        Search(ground, start, goal, has_heading, Steps.of(problem, SEARCH_CURVATURES[lane % 2]), prices).run()
-        for lane, prices in enumerate(costs)
-    ]
+    results = [Search(problem, SEARCH_CURVATURES[lane % 2], cost).run() for lane, cost in enumerate(costs)]
     paths = [path for path, _, _ in results if path is not None]
     if not paths:
         nearest, was_all = min(result[1] for result in results), all(result[2] for result in results)

@@ -20,9 +20,9 @@ from stroller import __main__ as job
 from stroller.planning import planner as planner_module
 from stroller.planning.plan import TIMES, planned_stage, seen_along
 from stroller.planning.planner import proposed
-from stroller.planning.problem import Obstacles, checked_problem, disc_distance, separation
-from stroller.planning.search import Costs, Ground, Search, Steps, paths_of, prices
-from stroller.planning.transcription import Rates, Task, actuation, drive_along, evaluate, interpolate
+from stroller.planning.problem import checked_problem, disc_distance, separation
+from stroller.planning.search import Costs, Search, paths_of, prices
+from stroller.planning.transcription import LIMIT_RESERVE, Rates, Task, actuation, drive_along, evaluate, interpolate
 
 BODY = stroller.Stroller(mass=5.0, wheelbase=0.25, inertia=0.1, steering_inertia=0.005)
 SCENE = stroller.Scene(BODY, friction=stroller.Damping(2.0, 0.5, 0.1, 0.05))
@@ -271,11 +271,10 @@ def test_a_search_keeps_to_what_the_limits_allow(steering, speed, bends, directi
     """And the optimiser may use the values of launch and goal, which are 0."""
     limits = stroller.Limits(steering=steering, speed=speed)
     problem = checked_problem(SCENE, START, GOAL, 12.0, GAP, limits, FOOTPRINT)
-    task, steps = Task.of(problem, 1.0, 12.0, 0.0), Steps.of(problem, 0.85)
+    task, search = Task.of(problem, 1.0, 12.0, 0.0), Search(problem, 0.85, Costs(0.0, 0.0, 1.0, 0.0))
     assert all(low <= 0.0 <= high for low, high in zip(task.low[:2], task.high[:2], strict=True))
-    moves = steps.arcs(0.1)
-    assert_close(np.unique(moves[:, 1]) / steps.sharpest, bends, atol=0.02)
-    assert tuple(np.unique(moves[:, 0])) == directions
+    assert_close(np.unique(search.moves[:, 1]) / search.sharpest, bends, atol=0.02)
+    assert tuple(np.unique(search.moves[:, 0])) == directions
 
 
 def test_a_solution_that_a_finer_run_refutes_is_not_the_end(monkeypatch):
@@ -313,13 +312,16 @@ def test_the_search_finds_the_shortest_path_on_the_empty_plane():
             random.uniform(-5.0, 5.0, 2),
             (random.uniform(-np.pi, np.pi), 0.25 * 4.0 ** random.random()),
         )
-        shortest, directions = ((dubins, (1.0,)), (reeds_shepp, (1.0, -1.0)))[number % 2]
-        start, goal = np.zeros(3), np.array([x, y, heading])
-        footprint = stroller.Footprint(1.4 * wheelbase, 0.87 * wheelbase, 0.2 * wheelbase)
-        ground = Ground.of(np.stack([start, goal]), Obstacles.of(()), footprint, 1.0)
-        path, _, _ = Search(ground, start, goal, True, Steps(-1.0, 1.0, directions), prices).run()
+        shortest, slowest = ((dubins, 0.0), (reeds_shepp, -1.0))[number % 2]
+        scene = stroller.Scene(dataclasses.replace(BODY, wheelbase=wheelbase))
+        # The search leaves the reserve of the limits out, and turns with a radius of 1 m at least.
+        limits = stroller.Limits(steering=np.arctan(wheelbase) / (1.0 - LIMIT_RESERVE), speed=(slowest, 1.0))
+        launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((x, y), heading)
+        search = Search(checked_problem(scene, launch, goal, 99.0, limits=limits), 1.0, prices)
+        assert_close(search.sharpest, 1.0)
+        path, _, _ = search.run()
         assert 1.0 - 1e-9 < path.length.sum() / shortest(*path.poses[-1]) < 1.1
-        assert np.hypot(*(path.poses[-1] - goal)[:2]) < ground.cell
+        assert np.hypot(*(path.poses[-1] - [x, y, heading])[:2]) < search.cell
 
 
 @pytest.mark.parametrize(("slowest", "direction"), [(-0.8, -1.0), (-0.1, 1.0)])
