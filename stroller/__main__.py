@@ -4,9 +4,9 @@ audit."""
 import argparse
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from html import escape
 from pathlib import Path
-from threading import Lock
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, k
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.terminal import Progress, status_line
-from nonholonomic.validation import as_number, replacing, require, require_folder
+from nonholonomic.validation import Bound, Bounded, as_number, replacing, require_folder
 
 from .friction import Damping
 from .model.dynamics import Stroller
@@ -70,15 +70,12 @@ GROUNDS = {
 }
 
 
-class Helm(eqx.Module):
+class Helm(Bounded):
     """Steer alternately left and right, by a torque towards a moving angle, and pull with a constant force."""
 
     force: Float[Array, ""] = eqx.field(converter=as_number)
     angle: Float[Array, ""] = eqx.field(converter=as_number)
-    period: Float[Array, ""] = eqx.field(converter=as_number)
-
-    def __check_init__(self) -> None:
-        require(self.period, "period", above=0.0)
+    period: Float[Array, ""] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         target = self.angle * jnp.sin(2.0 * jnp.pi * t / self.period)
@@ -147,42 +144,14 @@ def scenes(options: argparse.Namespace) -> dict[Name, tuple[Scene, Launch]]:
     return rides
 
 
-def audited(options: argparse.Namespace, helm: Helm, name: Name) -> tuple[Trajectory, list[str]]:
-    """One ride by Dopri8, and the lines of its energy audit, one for each integrator."""
-    scene, launch = scenes(options)[name]
-    runs = {
-        "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
-        "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
-    }
-    lines = []
-    for solver, run in runs.items():
-        residual, slip = (float(jnp.max(jnp.abs(part))) for part in (run.energy_residual, run.constraint))
-        energies = " ".join(f"{float(part):12.6f}" for part in (run.energy[0], run.energy[-1], run.work[-1]))
-        force, steps = float(jnp.min(run.normal_force)), int(run.stats.steps)
-        ride = f"{', '.join(name):38s} {solver:10s} {energies} {residual:10.1e} {slip:10.1e}"
-        lines.append(f"{ride} {force:10.3f} {steps:6d}  {run.status}")
-    return runs["Dopri8"], lines
-
-
-def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
-    """The largest energy residual over the tolerance of Dopri8, for the last ride."""
-    (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
-    lines = [f"Dopri8 {ground}, {ride}: largest residual [J] of energy minus work, by tolerance"]
-    for tolerance in TOLERANCES:
-        run = simulate(scene, launch, options.t1, helm, tolerance=tolerance)
-        residual = float(jnp.max(jnp.abs(run.energy_residual)))
-        lines.append(f"  {tolerance:7.0e}  {residual:8.1e}  in {int(run.stats.steps)} steps")
-    return lines
-
-
-def parked(options: argparse.Namespace) -> Plan:
-    """A planned drive into a gap between two strollers, on a level plane."""
+def parked(options: argparse.Namespace) -> tuple[Plan, list[str]]:
+    """A planned drive into a gap between two strollers, on a level plane, and its lines."""
     length = options.wheelbase
     body = Stroller(options.mass, length, options.inertia, options.steering_inertia)
     scene = Scene(body, friction=Damping(*options.damping), gravity=options.gravity, fork=options.fork)
     others = [Box((x * length, 0.0), (1.4 * length, 0.87 * length)) for x in (-2.2, 0.0, 3.7)]
     kerb = Box((0.75 * length, -0.95 * length), (8.0 * length, 0.4 * length))
-    return plan(
+    parking = plan(
         scene,
         Launch((2.9 * length, 1.5 * length), 0.0, 0.0),
         Goal((1.35 * length, 0.0), 0.0),
@@ -191,6 +160,35 @@ def parked(options: argparse.Namespace) -> Plan:
         limits=Limits(steering=1.0, speed=(-2.0 * length, 3.0 * length)),
         progress=False,
     )
+    return parking, [f"Parking: {parking}", "", HEADING]
+
+
+def audited(options: argparse.Namespace, helm: Helm, ground: str) -> tuple[dict[Name, Trajectory], list[str]]:
+    """The rides on a ground by Dopri8, which share one program, and the lines of their energy audit, for both integrators."""
+    rides, lines = {}, []
+    for name, (scene, launch) in scenes(options).items():
+        if name[0] != ground:
+            continue
+        rides[name] = simulate(scene, launch, options.t1, helm, tolerance=options.tolerance)
+        again = simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step))
+        for solver, run in {"Dopri8": rides[name], "midpoint": again}.items():
+            residual, slip = (float(jnp.max(jnp.abs(part))) for part in (run.energy_residual, run.constraint))
+            energies = " ".join(f"{float(part):12.6f}" for part in (run.energy[0], run.energy[-1], run.work[-1]))
+            force, steps = float(jnp.min(run.normal_force)), int(run.stats.steps)
+            ride = f"{', '.join(name):38s} {solver:10s} {energies} {residual:10.1e} {slip:10.1e}"
+            lines.append(f"{ride} {force:10.3f} {steps:6d}  {run.status}")
+    return rides, lines
+
+
+def tolerance_curve(options: argparse.Namespace, helm: Helm) -> tuple[None, list[str]]:
+    """Lines with the largest energy residual over the tolerance of Dopri8, for the last ride."""
+    (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
+    lines = ["", f"Dopri8 {ground}, {ride}: largest residual [J] of energy minus work, by tolerance"]
+    for tolerance in TOLERANCES:
+        run = simulate(scene, launch, options.t1, helm, tolerance=tolerance)
+        residual = float(jnp.max(jnp.abs(run.energy_residual)))
+        lines.append(f"  {tolerance:7.0e}  {residual:8.1e}  in {int(run.stats.steps)} steps")
+    return None, lines
 
 
 def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[views.Stage]:
@@ -204,67 +202,48 @@ def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[views.Stage]:
     return [planned_stage(parking), *(stage._replace(title=ground) for ground, stage in rides_by_ground)]
 
 
-def simulated(options: argparse.Namespace) -> tuple[Plan, dict[Name, Trajectory], list[str]]:
-    """The plan, the rides, and the lines of their audit; the plan and the lines are printed as soon as they are known."""
-    rides, audits = {}, [HEADING]
-    helm, scenes_to_run = Helm(options.force, options.steer, options.period), scenes(options)
-    # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
-    with Progress(len(scenes_to_run) + 2, "ride") as display, ThreadPoolExecutor(2) as threads:
-        display.begin()
-        locks = {ground: Lock() for ground, _ in scenes_to_run}
-
-        def in_turn(name: Name) -> tuple[Trajectory, list[str]]:
-            with locks[name[0]]:
-                return audited(options, helm, name)
-
-        planned = threads.submit(parked, options)
-        futures = {
-            name: threads.submit(in_turn, name) for name in sorted(scenes_to_run, key=lambda name: RIDES.index(name[1]))
-        }
-        curves = threads.submit(tolerance_curve, options, helm)
-
-        def print_lines(lines: list[str]) -> None:
-            with display.aside():
-                print("\n".join(lines), flush=True)
-            display.advance(1)
-
-        parking = planned.result()
-        print_lines([f"Parking: {parking}", "", HEADING])
-        for name in scenes_to_run:
-            rides[name], lines = futures[name].result()
-            audits += lines
-            print_lines(lines)
-        curve = ["", *curves.result()]
-        print_lines(curve)
-    return parking, rides, [*audits, *curve]
-
-
 def computed(options: argparse.Namespace) -> dict[str, bytes]:
-    """Plan the drive, simulate the rides, print their audit, and write all files.
+    """Plan the drive, simulate the rides, print their audit, each part as soon as it is known, and write all files.
 
     **Returns:** name -> contents of each file, and of the audit.
     """
-    parking, rides, audits = simulated(options)
+    grounds, helm = (
+        dict.fromkeys(ground for ground, _ in scenes(options)),
+        Helm(options.force, options.steer, options.period),
+    )
+    jobs = [partial(parked, options), *(partial(audited, options, helm, ground) for ground in grounds)]
+    jobs.append(partial(tolerance_curve, options, helm))
+    results, texts = [], []
+    # Compile in parallel, because the compiler uses little more than one core.
+    with Progress(len(jobs), "job") as display, ThreadPoolExecutor(2) as threads:
+        display.begin()
+        for future in [threads.submit(job) for job in jobs]:
+            result, lines = future.result()
+            results.append(result)
+            texts.append("\n".join(lines))
+            with display.aside():
+                print(texts[-1], flush=True)
+            display.advance(1)
+    parking, rides = results[0], {name: run for runs in results[1:-1] for name, run in runs.items()}
     names = ["_".join(name).replace(" ", "_") for name in rides]
     request = {name: value for name, value in vars(options).items() if name != "out"}
     with status_line("drawing"):
         table_of(list(rides.values()), names, request | {"ride": names}).save(options.out / "rides.h5")
         files, pictures = ["rides.h5"], []
         if views.can_draw():
-            grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
             for heading, name, figure in (
                 ("Parking", "parked.png", parking.plot()),
-                ("Paths, speeds, energies, side forces", "rides.png", draw_rides(grounds, rides)),
+                ("Paths, speeds, energies, side forces", "rides.png", draw_rides(rides)),
             ):
                 figure.savefig(options.out / name, dpi=110)
                 files.append(name)
                 pictures.append(f"<h2>{heading}</h2>{views.picture_as_html(options.out / name)}")
-        plan_text, audit = (f"<pre>{escape(text)}</pre>" for text in (str(parking), "\n".join(audits)))
+        audit = "\n".join([HEADING, *texts[1:]])
+        plan_text, audit = (f"<pre>{escape(text)}</pre>" for text in (str(parking), audit))
         sections = "".join([*pictures[:1], plan_text, "<h2>Energy against work</h2>", audit, *pictures[1:]])
         page = views.page_of_job(lambda: stages(parking, rides), "A stroller parks, and rides", 1.0, sections)
         page.save(options.out / PAGE)
-    printed = "\n".join([f"Parking: {parking}", "", *audits])
-    return {AUDIT: printed.encode()} | {name: (options.out / name).read_bytes() for name in [*files, PAGE]}
+    return {AUDIT: "\n".join(texts).encode()} | {name: (options.out / name).read_bytes() for name in [*files, PAGE]}
 
 
 def write(options: argparse.Namespace) -> views.Outputs:

@@ -4,14 +4,13 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic import views
-from nonholonomic.geometry import AbstractQuadric, AbstractSurface
 from nonholonomic.integration import AbstractPassive, ExtendedProblem
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import numbers
@@ -58,6 +57,21 @@ DRAWN_GRIP = 3.0
 GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 
+#: The drawn parts of a vehicle, its traces with their colours and widths [wheelbases], and the forces with their colours and
+#: longest arrows [wheelbases].
+PARTS = ("frame", "left wheel", "right wheel", "front wheel")
+TRACES = (("path of the rear axle", GREEN, 0.05), ("path of the front wheel", BLUE, 0.025))
+FORCES = (("normal force, rear", VIOLET, None), ("normal force, front", VIOLET, None))
+FORCES += (("side force, rear", GOLD, 2.0), ("side force, front", GOLD, 2.0))
+
+#: The quantities of a ride that are drawn.
+SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "load", "side_force")
+
+#: The curves that a page computes.
+CURVES = {"speed": "speed [m/s]", "steering": "steering angle [rad]", "energy": "energy [J]"}
+CURVES |= {"normal_force": "normal force [N]"}
+
+
 @stages_of.register(Trajectory)
 def _(run: Trajectory, runs: list[Trajectory], overlaid: bool, unit: Unit) -> list[views.Stage]:
     numbered = list(enumerate(runs))
@@ -68,73 +82,53 @@ def grouped(groups: list[list[tuple[int, Trajectory]]], names: list[str]) -> lis
     """A stage for each group of numbered rides on a common ground; `names` are the names of the rides."""
     stages = []
     for group in groups:
-        scene = group[0][1].model.scene
-        length = float(scene.body.wheelbase)
         shows = views.distinguished_by_colour(tuple(show(run, k, names[k]) for k, run in group))
-        points = np.concatenate([np.asarray(run.position) for _, run in group])
-        normal = normals(np, scene.surface, scene.side, np.asarray(group[0][1].position)[:1])[0]
-        ground = views.arena(scene.surface, points, normal, 3.0 * length, length)
+        ground = ground_of([run for _, run in group], shows[0].normal[0])
         stages.append(views.Stage("; ".join(body.name for body in shows), ground, shows))
     return stages
 
 
-def normals(xp: ModuleType, surface: AbstractSurface, side: str | None, position: Values) -> Any:
-    """Unit normals at positions (*times, 3), towards the side on which the stroller is. **Arguments:** `xp`: NumPy, or
-    `jax.numpy` for a page."""
-    components = surface.normal(surface.in_own_axes(tuple(position.T)))
-    zero = xp.zeros(position.shape[:-1])
-    filled = tuple(zero if part is None else xp.asarray(part) + zero for part in components)
-    return surface.sign(side, DRIVES) * xp.stack([xp.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
+def ground_of(rides: list[Trajectory], normal: np.ndarray) -> views.Arena:
+    """The part of the ground on which rides take place."""
+    scene, points = rides[0].model.scene, np.concatenate([np.asarray(ride.position) for ride in rides])
+    length = float(scene.body.wheelbase)
+    return views.arena(scene.surface, points, normal, 3.0 * length, length)
 
 
-class Posture(NamedTuple):
-    """The drawn parts of a vehicle.
+def drawn(
+    xp: ModuleType, scene: Scene, values: dict[str, Any], angles: Sequence[Values] | Values
+) -> tuple[Values, list[tuple[Values, Values]], list[Values], list[tuple[Values, Values]]]:
+    """What is drawn of a vehicle: the ground's normal towards it; the place and the rotation of each of `PARTS`; the points of
+    `TRACES`; and start and vector of each of `FORCES`.
 
-    - `places`, `rotations`: where frame, left, right and front wheel are, and how they are rotated.
-    - `contacts`: the points above the ground at the rear axle and the front wheel; `up`, `left`: the axes along which
-      the ground's forces act there.
+    **Arguments:** `xp`: NumPy for a picture, or `jax.numpy` for a page; `values`: the quantities of a ride (*times, ...);
+    `angles` [rad] by which left, right and front wheel have rolled.
     """
-
-    places: tuple[Any, ...]
-    rotations: tuple[Any, ...]
-    contacts: tuple[Any, Any]
-    up: Any
-    left: tuple[Any, Any]
-
-    @classmethod
-    def of(
-        cls,
-        xp: ModuleType,
-        length: Values | float,
-        position: Values,
-        direction: Values,
-        normal: Values,
-        steering: Values,
-        angles: Sequence[Values] | Values,
-    ) -> "Posture":
-        """The parts of a vehicle with a wheelbase [m], for its quantities (*times, ...), the ground's normal, and the
-        angles [rad] by which left, right and front wheel have rolled. **Arguments:** `xp`: as for `normals`."""
-        x = direction / xp.linalg.norm(direction, axis=-1, keepdims=True)
-        y = xp.cross(normal, x)
-        y = y / xp.linalg.norm(y, axis=-1, keepdims=True)
-        z = xp.cross(x, y)
-        cosine, sine = xp.cos(steering)[..., None], xp.sin(steering)[..., None]
-        forward, left = cosine * x + sine * y, cosine * y - sine * x
-        radius, half = RADIUS * length, 0.5 * TRACK * length
-        axle, front = position + radius * z, position + length * x + radius * z
-
-        def rolled(ahead: Values, axis: Values, angle: Values) -> Values:
-            cosine, sine = xp.cos(angle)[..., None], xp.sin(angle)[..., None]
-            return xp.stack([cosine * ahead - sine * z, axis, sine * ahead + cosine * z], axis=-1)
-
-        wheels = (rolled(x, y, angles[0]), rolled(x, y, angles[1]), rolled(forward, left, angles[2]))
-        return cls(
-            (axle, axle + half * y, axle - half * y, front),
-            (xp.stack([x, y, z], axis=-1), *wheels),
-            (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z),
-            z,
-            (y, left),
-        )
+    surface, length, position = scene.surface, scene.body.wheelbase, values["position"]
+    zero = xp.zeros(position.shape[:-1])
+    components = surface.normal(surface.in_own_axes(tuple(position.T)))
+    filled = tuple(zero if part is None else xp.asarray(part) + zero for part in components)
+    outward = xp.stack([xp.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
+    normal = surface.sign(scene.side, DRIVES) * outward
+    x = values["direction"] / xp.linalg.norm(values["direction"], axis=-1, keepdims=True)
+    y = xp.cross(normal, x)
+    y = y / xp.linalg.norm(y, axis=-1, keepdims=True)
+    z = xp.cross(x, y)
+    cosine, sine = xp.cos(values["steering"])[..., None], xp.sin(values["steering"])[..., None]
+    forward, left = cosine * x + sine * y, cosine * y - sine * x
+    radius, half = RADIUS * length, 0.5 * TRACK * length
+    axle, front = position + radius * z, position + length * x + radius * z
+    bodies = [(axle, xp.stack([x, y, z], axis=-1))]
+    ends = ((axle + half * y, x, y), (axle - half * y, x, y), (front, forward, left))
+    for (place, ahead, axis), angle in zip(ends, angles, strict=True):
+        cosine, sine = xp.cos(angle)[..., None], xp.sin(angle)[..., None]
+        bodies.append((place, xp.stack([cosine * ahead - sine * z, axis, sine * ahead + cosine * z], axis=-1)))
+    # Above the ground, where lines are visible.
+    contacts = [position + 0.02 * radius * z, position + length * x + 0.02 * radius * z]
+    forces = [(contact, values["load"][..., k, None] * z) for k, contact in enumerate(contacts)]
+    lefts = zip(contacts, (y, left), strict=True)
+    forces += [(contact, values["side_force"][..., k, None] * axis) for k, (contact, axis) in enumerate(lefts)]
+    return normal, bodies, contacts, forces
 
 
 def show(run: Trajectory, number: int, name: str) -> views.Show:
@@ -143,22 +137,18 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
 
     scene = run.model.scene
     length, colour = float(scene.body.wheelbase), views.COLOURS[number % len(views.COLOURS)]
-    radius, half = RADIUS * length, TRACK * length / 2.0
+    radius, yaw = RADIUS * length, 0.5 * TRACK * length * np.asarray(run.yaw_rate)
     times, reader = refined(run, radius)
-    normal = reader(normals(np, scene.surface, scene.side, np.asarray(run.position)))
-    yaw = half * np.asarray(run.yaw_rate)
     speeds = (np.asarray(run.speed) - yaw, np.asarray(run.speed) + yaw, np.asarray(run.front_speed))
     angles = [reader(cumulative_trapezoid(speed / radius, np.asarray(run.t), initial=0.0)) for speed in speeds]
-    drawn = (reader(run.position), reader(run.direction), normal, reader(run.steering))
-    posture = Posture.of(np, length, *drawn, angles)
+    values = {name: reader(run[name]) for name in SHOWN}
+    normal, bodies, points, forces = drawn(np, scene, values, angles)
     wheel_mesh = views.wheel(radius, WIDTH * length, (views.DARK, views.PALE))
-    names = ("frame", "left wheel", "right wheel", "front wheel")
     meshes = (vehicle(length, colour), wheel_mesh, wheel_mesh, wheel_mesh)
-    parts = zip(names, posture.places, posture.rotations, meshes, strict=True)
-    (rear, front), (rear_left, front_left), up = posture.contacts, posture.left, posture.up
-    loads, forces = reader(run.load), reader(run.side_force)
     scale, width = WEIGHT * length / float(scene.body.mass * scene.gravity), 0.035 * length
     grip = np.asarray(run["grip"])[:, : len(run.loaded_axles)]
+    curves = [views.Curve(label, values[quantity]) for quantity, label in CURVES.items()]
+    curves.append(views.Curve("friction that the tyres need [1]", reader(np.minimum(grip, DRAWN_GRIP)).max(axis=-1)))
     warning = f"needs friction {np.max(grip):.2g}, more than any tyre provides: a real stroller would slip"
     return views.Show(
         name,
@@ -166,24 +156,21 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
         times,
         normal,
         SIZE * length,
-        tuple(views.Body(part, place, views.turned(rotation), mesh) for part, place, rotation, mesh in parts),
-        (
-            views.Trace("path of the rear axle", rear, GREEN, 0.05 * length),
-            views.Trace("path of the front wheel", front, BLUE, 0.025 * length),
+        tuple(
+            views.Body(part, place, views.turned(rotation), mesh)
+            for part, (place, rotation), mesh in zip(PARTS, bodies, meshes, strict=True)
         ),
-        (
-            views.Arrow("normal force, rear", rear, loads[:, :1] * up, "N", scale, VIOLET, width, through=True),
-            views.Arrow("normal force, front", front, loads[:, 1:] * up, "N", scale, VIOLET, width, through=True),
-            views.Arrow("side force, rear", rear, forces[:, :1] * rear_left, "N", scale, GOLD, width, 2.0 * length),
-            views.Arrow("side force, front", front, forces[:, 1:] * front_left, "N", scale, GOLD, width, 2.0 * length),
+        tuple(
+            views.Trace(label, line, colour, share * length)
+            for (label, colour, share), line in zip(TRACES, points, strict=True)
         ),
-        (
-            views.Curve("speed [m/s]", reader(run.speed)),
-            views.Curve("steering angle [rad]", reader(run.steering)),
-            views.Curve("energy [J]", reader(run.energy)),
-            views.Curve("normal force [N]", reader(run.normal_force)),
-            views.Curve("friction that the tyres need [1]", reader(np.minimum(grip, DRAWN_GRIP).max(axis=-1))),
+        tuple(
+            views.Arrow(
+                label, start, vector, "N", scale, colour, width, limit and limit * length, through=limit is None
+            )
+            for (label, colour, limit), (start, vector) in zip(FORCES, forces, strict=True)
         ),
+        tuple(curves),
         warning if np.max(grip) > MOST_GRIP else "",
     )
 
@@ -229,12 +216,6 @@ def vehicle(length: float, colour: int) -> tuple[views.Mesh, ...]:
 
 
 # A page with sliders that simulates a ride in the browser.
-
-#: Number of curves of `show` that the page computes.
-CURVES = 4
-
-#: The quantities of a ride that the page draws.
-SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "load", "side_force")
 
 
 @status_line("writing a page")
@@ -293,6 +274,12 @@ def explore(
 @page_of.register(RideModel)
 def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, views.Stage]:
     """The contents of the page, and the stage."""
+
+    def rolling(model: RideModel) -> ExtendedProblem[RideProblem]:
+        """A ride of one cell with the rolling angles of its wheels."""
+        ride = RideProblem.of(model.scene, model.launch, model.input, 1, False, model.jumps)
+        return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
+
     knobs = sliders_of(model, default_ranges(model.scene, model.launch) if sliders is None else sliders)
     live = live_run(
         model,
@@ -304,9 +291,14 @@ def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[
         title=f"Stroller on a {type(model.scene.surface).__name__.lower()}",
         answer=("distance from the start", "m"),
         summaries=(Summary("speed", "m/s", 0), Summary("energy", "J", 2)),
-        motion=rolling_ride,
+        motion=rolling,
     )
-    return live, stage(runs_at_ends(model, knobs, t1))
+    rides = runs_at_ends(model, knobs, t1)
+    (stage,) = rides[0].stages()
+    # The page would not update the curve of the friction that the tyres need, which `frame` does not compute.
+    shows = tuple(show._replace(curves=show.curves[: len(CURVES)]) for show in stage.shows)
+    # On a part of the ground that contains all rides.
+    return live, stage._replace(shows=shows, arena=ground_of(rides, stage.arena.normal))
 
 
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
@@ -334,12 +326,6 @@ class WheelAngles(AbstractPassive):
         return jnp.concatenate([problem.field(time, state), speeds / (RADIUS * length)])
 
 
-def rolling_ride(model: RideModel) -> ExtendedProblem[RideProblem]:
-    """A ride of one cell with the rolling angles of its wheels."""
-    ride = RideProblem.of(model.scene, model.launch, model.input, 1, False, model.jumps)
-    return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
-
-
 def outcome(model: RideModel, problem: RideProblem, lane: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
     first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
@@ -349,109 +335,70 @@ def outcome(model: RideModel, problem: RideProblem, lane: Any) -> tuple[Int[Arra
     return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
 
 
-def stage(rides: list[Trajectory]) -> views.Stage:
-    """The stage of the first ride, on a part of the ground that contains all rides."""
-    (first,), scene = rides[0].stages(), rides[0].model.scene
-    length = float(scene.body.wheelbase)
-    points = np.concatenate([np.asarray(ride.position) for ride in rides])
-    # The page would not update the curve of the friction that the tyres need, which `frame` does not compute.
-    shows = tuple(show._replace(curves=show.curves[:CURVES]) for show in first.shows)
-    ground = views.arena(scene.surface, points, first.arena.normal, 3.0 * length, length)
-    return first._replace(shows=shows, arena=ground)
-
-
 def frame(scene: Scene, controls: Input | None, time: Array, rows: Float[Array, "rows 1"]) -> Frame:
     """The drawn quantities of a stroller at one time, in the order of `show`. The rows end with the rolling angles of
     the wheels."""
     state = RideState(scene, controls, time, rows[:-3])
-    outputs = {name: QUANTITIES[name].of(name, state)[0] for name in SHOWN}
-    length, position = scene.body.wheelbase, outputs["position"]
-    normal = normals(jnp, scene.surface, scene.side, position)
-    posture = Posture.of(jnp, length, position, outputs["direction"], normal, outputs["steering"], rows[-3:, 0])
-    rotations = [quaternion(rotation) for rotation in posture.rotations]
-    (rear, front), load, side_force = posture.contacts, outputs["load"], outputs["side_force"]
+    values = {name: QUANTITIES[name].of(name, state)[0] for name in SHOWN}
+    normal, bodies, points, forces = drawn(jnp, scene, values, rows[-3:, 0])
+    fastest = jnp.maximum(jnp.abs(values["speed"]), jnp.abs(values["front_speed"]))
     return Frame(
         normal=normal,
-        bodies=tuple(zip(posture.places, rotations, strict=True)),
-        traces=((rear, None), (front, None)),
-        arrows=(
-            (rear, load[0] * posture.up),
-            (front, load[1] * posture.up),
-            (rear, side_force[0] * posture.left[0]),
-            (front, side_force[1] * posture.left[1]),
-        ),
-        curves=(outputs["speed"], outputs["steering"], outputs["energy"], outputs["normal_force"]),
-        turning_rate=jnp.maximum(jnp.abs(outputs["speed"]), jnp.abs(outputs["front_speed"])) / (RADIUS * length),
+        bodies=tuple((place, quaternion(rotation)) for place, rotation in bodies),
+        traces=tuple((point, None) for point in points),
+        arrows=tuple(forces),
+        curves=tuple(values[name] for name in CURVES),
+        turning_rate=fastest / (RADIUS * scene.body.wheelbase),
     )
 
 
 # The plot of the main job (needs matplotlib): paths on the ground, speed, energy and side forces.
 
 
-def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str], Trajectory]) -> Any:
+def draw_rides(rides: dict[tuple[str, str], Trajectory]) -> Any:
     """Draw rides, one row of plots per ground.
 
-    **Arguments:**
-
-    - `grounds`: name of a ground -> the ground.
-    - `rides`: (name of a ground, name of a ride) -> its trajectory.
+    **Arguments:** `rides`: (name of a ground, name of a ride) -> its trajectory.
 
     **Returns:** a matplotlib figure.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
+    grounds = list(dict.fromkeys(ground for ground, _ in rides))
     figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
     layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
     # As on the page, whose curves are those of all grounds, after that of a plan.
     colours = {name: views.css(views.COLOURS[number % len(views.COLOURS)]) for number, name in enumerate(rides, 1)}
-    for row, (name, ground) in enumerate(grounds.items()):
-        on_ground = {ride: run for (place_name, ride), run in rides.items() if place_name == name}
+    for row, ground in enumerate(grounds):
+        on_ground = {name: run for name, run in rides.items() if name[0] == ground}
         space = figure.add_subplot(layout[row, 0], projection="3d")
-        _draw_ground(space, ground, on_ground)
+        # The lines of the ground do not depend on the side.
+        lines = np.array(ground_of(list(on_ground.values()), np.array([0.0, 0.0, 1.0])).lines)
+        for line in lines:
+            space.plot(*line.T, color="0.75", linewidth=0.4)
         panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]
-        for name_of_ride, run in on_ground.items():
-            colour = colours[name, name_of_ride]
-            space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=name_of_ride)
+        for name, run in on_ground.items():
+            colour = colours[name]
+            space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=name[1])
             panels[0].plot(run.t, run.speed, color=colour)
             panels[1].plot(run.t, run.energy, color=colour)
             panels[1].plot(run.t, run.energy[0] + run.work, color="black", linewidth=0.8, linestyle=":")
             panels[2].plot(run.t, run.side_force[:, 0], color=colour)
             panels[2].plot(run.t, run.side_force[:, 1], color=colour, linestyle="--")
-        space.set_title(name)
+        space.set(title=ground, xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+        # As many ticks along each axis as there is room for; a plane has nearly no height to show.
+        spans = np.ptp(lines, axis=(0, 1))
+        for axis, span in zip((space.xaxis, space.yaxis, space.zaxis), spans, strict=True):
+            axis.set_major_locator(MaxNLocator(max(round(4.0 * span / max(spans)), 1)))
+        if spans[2] < 0.1 * max(spans):
+            space.set(zticks=[], zlabel="")
+        space.set_aspect("equal")
         space.legend(fontsize="small")
         for panel, label in zip(panels, ("speed [m/s]", "energy [J]", "side force [N]"), strict=True):
-            panel.set_xlabel("time [s]")
-            panel.set_ylabel(label)
+            panel.set(xlabel="time [s]", ylabel=label)
         # The legend beside the path explains the colours; this one explains the line styles, above, where it hides
         # nothing.
         panels[1].set_title("dotted: start plus work", fontsize="small")
         panels[2].set_title("full: rear axle, dashed: front wheel", fontsize="small")
     return figure
-
-
-def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajectory]) -> None:
-    """A wire frame of the ground as far as the rides go."""
-    from matplotlib.ticker import MaxNLocator
-
-    places = np.concatenate([np.asarray(run.place) for run in rides.values()])
-    first, second = (
-        np.linspace(part.min() - 0.3, part.max() + 0.3, 13) if unit == "m" else np.linspace(-np.pi, np.pi, 49)
-        for part, (_, unit) in zip(places.T, ground.coordinates, strict=True)
-    )
-    if isinstance(ground, AbstractQuadric):
-        second = np.linspace(-np.pi / 2, min(places[:, 1].max() + 0.1, np.pi / 2), 13)
-    grid = tuple(np.meshgrid(first, second, indexing="ij"))
-    x, y, z = (np.asarray(part) for part in ground.in_fixed_frame(ground.chart(grid)[0]))
-    space.plot_wireframe(x, y, z, color="0.75", linewidth=0.4)
-    space.set_xlabel("x [m]", labelpad=8)
-    space.set_ylabel("y [m]", labelpad=8)
-    space.set_zlabel("z [m]")
-    # As many ticks along each axis as there is room for.
-    spans = [np.ptp(part) for part in (x, y, z)]
-    for axis, span in zip((space.xaxis, space.yaxis, space.zaxis), spans, strict=True):
-        axis.set_major_locator(MaxNLocator(max(round(4.0 * span / max(spans)), 1)))
-    # A plane has nearly no height to show.
-    if spans[2] < 0.1 * max(spans):
-        space.set_zticks([])
-        space.set_zlabel("")
-    space.set_aspect("equal")
