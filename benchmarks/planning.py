@@ -86,7 +86,7 @@ def on_plane(seed: int) -> Iterator[Problem]:
             continue
         launch, target = stroller.Launch(*start, 0.0), stroller.Goal(*goal)
         problem = Problem(scene, launch, target, T1, tuple(boxes), LIMITS, FOOTPRINT)
-        if problem.clearance_at_ends > FREE:
+        if min(map(np.min, problem.gaps_at_ends.values())) > FREE:
             yield problem
 
 

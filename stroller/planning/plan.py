@@ -113,18 +113,23 @@ class Plan(eqx.Module):
         obstacles = "1 obstacle" if count == 1 else f"{count} obstacles"
         place, heading, speed = self.errors
         turn = "" if goal.heading is None else f"heading {heading:.2g} rad, "
-        lines = [
-            f"Plan of {self.t1:.4g} s: {'reaches the goal' if self.reached else 'does not reach the goal'}",
-            f"  end        place off by {place:.2g} m, {turn}speed {speed:.2g} m/s; allowed {float(goal.within):g}",
-            *([f"  clearance  {self.clearance:.3g} m from {obstacles}"] if count else []),
-            *(f"  {name:9s}  margin {margin:.3g} {units[name]}".rstrip() for name, margin in self.margins.items()),
-            f"  effort     {self.effort:.4g} N² s",
-            f"  grip       {self.run.grip_in_words}",
-            f"  tried      {len(self.candidates)} candidates",
-            *(f"  hindrance  {words}" for words in self.hindrances),
+        end = f"place off by {place:.2g} m, {turn}speed {speed:.2g} m/s; allowed {float(goal.within):g}"
+        measured = [
+            (f"end        {end}", sum(self.errors)),
+            *([(f"clearance  {self.clearance:.3g} m from {obstacles}", self.clearance)] if count else []),
+            *(
+                (f"{name:9s}  margin {margin:.3g} {units[name]}".rstrip(), margin)
+                for name, margin in self.margins.items()
+            ),
+            (f"effort     {self.effort:.4g} N² s", self.effort),
+            (f"grip       {self.run.grip_in_words}", float(np.max(self.run.grip()))),
+            (f"tried      {len(self.candidates)} candidates", 0.0),
+            *((f"hindrance  {words}", 0.0) for words in self.hindrances),
         ]
+        verdict = "reaches the goal" if self.reached else "does not reach the goal"
         # A run that failed has no end, and no value of what depends on it.
-        return "\n".join(line for line in lines if " nan " not in line)
+        lines = [text for text, number in measured if not np.isnan(number)]
+        return "\n  ".join([f"Plan of {self.t1:.4g} s: {verdict}", *lines])
 
     def plot(self, unit: str | Sequence[str] | None = None) -> Any:
         """Draw the plan from above, or in space on a curved ground: its goal, obstacles, footprint and candidates; and its
@@ -617,15 +622,17 @@ def planned_stage(plan: Plan) -> Stage:
         still.append(("obstacles", [prism(foot, HEIGHT * length) for foot in feet]))
     ends = goal_corners(problem, 2.0 * RAISED * length)
     pairs = (ends[:2], ends[2:]) if problem.goal.heading is None else (ends, np.roll(ends, -1, axis=0))
-    still.append(("goal", [bars(*pairs, 2.0 * THIN * length, GREEN)]))
+    arms = zip(*(map(tuple, points) for points in pairs), strict=True)
+    still.append(("goal", [bar(a, b, 2.0 * THIN * length, GREEN) for a, b in arms]))
     place, turn = np.zeros((count, 3)), np.tile(UNTURNED, (count, 1))
     bodies = tuple(Body(name, place, turn, tuple(meshes)) for name, meshes in still)
     vehicle = show.bodies[0]
     own = problem.footprint.corners(np.zeros(2), np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     # The frame's origin is the middle of the rear axle, above the ground.
     low = np.concatenate([np.asarray(own), np.full((4, 1), -0.17 * length)], axis=1)
-    edge = bars(low, np.roll(low, -1, axis=0), 1.5 * THIN * length, DARK)
-    footprint = Body("footprint", vehicle.position, vehicle.orientation, (edge,))
+    edges = zip(map(tuple, low), map(tuple, np.roll(low, -1, axis=0)), strict=True)
+    frame = tuple(bar(a, b, 1.5 * THIN * length, DARK) for a, b in edges)
+    footprint = Body("footprint", vehicle.position, vehicle.orientation, frame)
     name = f"plan of {plan.t1:.3g} s"
     title = f"{name}: {'reaches the goal' if plan.reached else 'does not reach the goal'}"
     shows = (show._replace(name=name, bodies=(*show.bodies, footprint, *bodies)),)
@@ -656,14 +663,6 @@ def prism(foot: Float[np.ndarray, "corners 3"], height: float) -> Mesh:
     columns = np.stack([np.broadcast_to(top.mean(axis=0), top.shape), top, foot], axis=1)
     closed = np.concatenate([columns, columns[:1]])
     return Mesh(closed.reshape(-1, 3), of_grid(len(closed), 3), STONE)
-
-
-def bars(starts: Float[np.ndarray, "bars 3"], ends: Float[np.ndarray, "bars 3"], radius: float, colour: int) -> Mesh:
-    """Round bars between pairs of points, as one mesh."""
-    meshes = [bar(tuple(a), tuple(b), radius, colour) for a, b in zip(starts, ends, strict=True)]
-    vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    triangles = [mesh.triangles + k * len(mesh.vertices) for k, mesh in enumerate(meshes)]
-    return Mesh(vertices, np.concatenate(triangles), colour)
 
 
 def ribbon(line: Float[np.ndarray, "points 3"], raised: float, half: float) -> Mesh:

@@ -47,13 +47,20 @@ DRAWN = (1.4, 0.87, 0.2)
 SMALLEST_SQUARE = 1e-18
 
 
-def require_pair(value: object, name: str, example: str) -> None:
-    """Raise `ValueError` unless the value is a pair of single numbers."""
-    if not (isinstance(value, tuple) and len(value) == 2 and all(np.shape(number) == () for number in value)):
-        raise ValueError(f"{name} = {shown(value)} must be a pair of numbers, such as {example}")
+class Obstacle(Bounded):
+    """An obstacle, whose tuples are pairs of single numbers."""
+
+    def __check_init__(self):
+        for name, example in {"centre": "(1.0, 0.5)", "size": "(0.5, 0.25)"}.items():
+            if hasattr(self, name):
+                value = getattr(self, name)
+                if not (
+                    isinstance(value, tuple) and len(value) == 2 and all(np.shape(number) == () for number in value)
+                ):
+                    raise ValueError(f"{name} = {shown(value)} must be a pair of numbers, such as {example}")
 
 
-class Box(Bounded):
+class Box(Obstacle):
     """A rectangular obstacle in the coordinates x and y.
 
     **Arguments:**
@@ -80,10 +87,6 @@ class Box(Bounded):
     size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers, metadata=Bound.POSITIVE)
     angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
 
-    def __check_init__(self):
-        require_pair(self.centre, "centre", "(1.0, 0.5)")
-        require_pair(self.size, "size", "(0.5, 0.25)")
-
     @property
     def corners(self) -> Float[np.ndarray, "4 2"]:
         """The corners [m], counterclockwise."""
@@ -99,7 +102,7 @@ class Box(Bounded):
         return np.where(gap > 0.0, apart, gap)
 
 
-class Disc(Bounded):
+class Disc(Obstacle):
     """A round obstacle in the coordinates x and y.
 
     **Arguments:**
@@ -123,9 +126,6 @@ class Disc(Bounded):
 
     centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
     radius: Float[Array, ""] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
-
-    def __check_init__(self):
-        require_pair(self.centre, "centre", "(1.0, 0.5)")
 
     def distance(self, polygon: Points) -> Numbers:
         """The exact distance [m] of polygons from the disc, negative where they overlap."""
@@ -419,10 +419,10 @@ def pose_of(scene: Scene, place: tuple[ArrayLike, ...], heading: Float[Array, ""
 
 
 @eqx.filter_jit
-def _poses_at(
-    surface: AbstractSurface, tangent: Float[Array, "3 3"] | None, points: Float[Array, "n 3"]
+def poses_at(
+    surface: AbstractSurface, tangent: Float[Array | np.ndarray, "3 3"] | None, points: Float[Array | np.ndarray, "n 3"]
 ) -> Float[Array, "n components"]:
-    """The poses of points and headings on the map of a problem."""
+    """The poses of points and headings on the map of a problem. **Arguments:** `tangent`: that of the `Problem`."""
 
     def position(point: Float[Array, " 2"]) -> Float[Array, " axes"]:
         if tangent is None:
@@ -472,18 +472,13 @@ class Problem(eqx.Module):
         """The straight distance [m] from the start to the goal."""
         return float(np.linalg.norm(np.asarray(self.goal_pose - self.start_pose)[: self.scene.surface.axes]))
 
-    @property
-    def is_flat(self) -> bool:
-        """Whether the ground names its places by two lengths, x and y."""
-        return tuple(self.scene.surface.coordinates) == (("x", "m"), ("y", "m"))
-
     @functools.cached_property
     def tangent(self) -> Float[np.ndarray, "3 3"] | None:
         """The origin and the unit vectors of the plane whose points stand for the nearest ones of the ground; `None` if the
         ground names its places x and y."""
-        if self.is_flat:
-            return None
         surface, axes = self.scene.surface, self.scene.surface.axes
+        if tuple(surface.coordinates) == (("x", "m"), ("y", "m")):
+            return None
         middle = (self.start_pose[:axes] + self.goal_pose[:axes]) / 2.0
         position, east, _ = surface.chart(surface.place_at(surface.nearest(padded(middle))))
         north = scale(self.scene.dynamics.side, cross(surface.normal(position), east))
@@ -499,11 +494,6 @@ class Problem(eqx.Module):
             place, heading = plane @ (place - origin), plane @ heading
         return np.array([place[0], place[1], np.arctan2(heading[1], heading[0])])
 
-    def poses_at(self, points: Float[np.ndarray, "n 3"]) -> Float[Array, "n components"]:
-        """The poses of points and headings on the map."""
-        tangent = None if self.tangent is None else jnp.asarray(self.tangent)
-        return _poses_at(self.scene.surface, tangent, jnp.asarray(points))
-
     @functools.cached_property
     def gaps_at_ends(self) -> dict[str, Float[np.ndarray, " obstacles"]]:
         """The distance [m] of the footprint from every obstacle at the launch and at the goal, negative for an overlap; at the
@@ -516,14 +506,10 @@ class Problem(eqx.Module):
         return {"launch": launch, "goal": max(goals, key=np.min)}
 
     @property
-    def clearance_at_ends(self) -> float:
-        """The distance [m] of the footprint from the obstacles at the start and at the goal; infinite without obstacles."""
-        return float(min(map(np.min, self.gaps_at_ends.values()))) if self.obstacles else np.inf
-
-    @property
     def clearance(self) -> float:
-        """The clearance [m] to keep at first."""
-        return min(RESERVE * float(self.footprint.length), 0.5 * self.clearance_at_ends)
+        """The clearance [m] to keep at first, which the start and the goal leave."""
+        at_ends = map(np.min, self.gaps_at_ends.values() if self.obstacles else ())
+        return min(RESERVE * float(self.footprint.length), *(0.5 * float(gap) for gap in at_ends))
 
 
 def checked_problem(
@@ -582,7 +568,7 @@ def _require_free(problem: Problem) -> None:
     surface = problem.scene.surface
     if not problem.obstacles:
         return
-    if not problem.is_flat:
+    if problem.tangent is not None:
         names = ", ".join(f"{name} [{unit}]" for name, unit in surface.coordinates)
         raise ValueError(
             f"obstacles: a {type(surface).__name__} names its places ({names}); obstacles need a ground with places "

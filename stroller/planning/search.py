@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from .problem import FAR, Numbers, Obstacles, Problem
+from .problem import FAR, Numbers, Obstacles, Problem, poses_at
 from .transcription import LIMIT_RESERVE, ORDER
 
 # The region of a search, and what the stroller may do there.
@@ -408,7 +408,7 @@ def guess_of(problem: Problem, path: Path) -> tuple[Float[np.ndarray, "rows unkn
     points, speed, curvature = timed(path, INTERVALS + 1, t1, wheelbase)
     steering = smoothed(np.arctan(wheelbase * curvature), SMOOTHING[0])
     front_speed = smoothed(speed, SMOOTHING[1]) / np.cos(steering)
-    poses = np.asarray(problem.poses_at(points))
+    poses = np.asarray(poses_at(scene.surface, problem.tangent, points))
     poses = np.concatenate([poses, poses[-1:], poses[-1:]])
     splines = np.pad(np.stack([steering, front_speed], axis=1), ((1, ORDER - 3), (0, 0)), mode="edge")
     return np.concatenate([poses, splines], axis=1), t1

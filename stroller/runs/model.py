@@ -180,11 +180,8 @@ class RideModel(AbstractSceneModel):
         return self.event is not None or not isinstance(self.scene.surface, Plane)
 
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
-        if cells is None:
-            ride = RideProblem.of(self.scene, self.launch, self.input, jumps=self.jumps)
-        else:
-            watched = self.event is None and names is not None and not names
-            ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched, self.jumps)
+        watched = cells is not None and self.event is None and names is not None and not names
+        ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched, self.jumps)
         # The state ends with the time if a quantity depends on the input.
         return ride if self.input is None or names is None or TIMED.isdisjoint(names) else with_clock(ride)
 
@@ -229,23 +226,26 @@ class RideModel(AbstractSceneModel):
 run_of.register(RideModel, ride)
 
 
+#: What takes lists in place of single numbers, for messages.
+LISTS = "axes of sweep take lists, and jax.vmap maps over them"
+
+
 @model_of.register(Scene)
 def _(system: Scene, start: Any, event: Any = None, input: Input | None = None, jumps: object = None) -> AbstractModel:
     require_kind(start, "start", Launch)
-    lists = "axes of sweep take lists, and jax.vmap maps over them"
-    require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), lists)
+    require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), LISTS)
     system.check(start)
     check_input(input, system, start, jumps)
     return RideModel.of(system, start, input, event, jumps)
 
 
-def check_run(scene: Any, launch: Any, t1: ArrayLike, input: Any, tolerance: ArrayLike, jumps: object = None) -> None:
-    """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
-    launch."""
-    lists = "axes of sweep take lists, and jax.vmap maps over them"
-    require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
-    scene.check(launch)
-    check_input(input, scene, launch, jumps)
+def checked_model(
+    scene: Any, launch: Any, t1: ArrayLike, input: Any, tolerance: ArrayLike, jumps: object = None
+) -> AbstractModel:
+    """The model of a ride; raises `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can
+    start with the launch."""
+    require_run(scene, launch, t1, tolerance, (Scene, Launch), LISTS)
+    return model_of(scene, launch, None, input, jumps)
 
 
 # The functions of the stroller, on those of `nonholonomic.runs`.
@@ -314,8 +314,8 @@ def simulate(
 
     ```
     """
-    check_run(scene, launch, t1, input, tolerance, jumps)
-    return ride(RideModel.of(scene, launch, input, None, jumps), t1, times, tolerance, solver, adjoint, max_steps)
+    model = checked_model(scene, launch, t1, input, tolerance, jumps)
+    return ride(model, t1, times, tolerance, solver, adjoint, max_steps)
 
 
 def sweep(
@@ -377,10 +377,9 @@ def sweep(
     ```
     """
     require_outside((scene, launch, t1, axes, input, jumps), "sweep", "simulate")
-    check_run(scene, launch, t1, input, tolerance, jumps)
+    model = checked_model(scene, launch, t1, input, tolerance, jumps)
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {shown(axes)} must be a dictionary, full name of a parameter -> values")
-    model = RideModel.of(scene, launch, input, None, jumps)
     options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor)
     return table_of(model, full_axes(axes, model.known), float(t1), "first", options, FORM)
 

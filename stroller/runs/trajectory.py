@@ -237,7 +237,7 @@ class RideSpec(eqx.Module):
 Lanes = Float[np.ndarray, " lanes"]
 States = Float[np.ndarray, "components lanes"]
 
-#: Number of states in a call of a compiled function, always the same, so that it is compiled once.
+#: Number of states in a call of the compiled function, always the same, so that it is compiled once.
 WIDTH = 256
 
 
@@ -250,48 +250,50 @@ class Steps(NamedTuple):
     def at(self, spec: RideSpec, times: Lanes) -> States:
         """The states at the given times [s]; NaN after the end of the run."""
         step = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
-        ends = np.where(times == self.times[step], step, step + 1)
-        states = self.states[:, ends]
-        is_inside = (times > self.times[step]) & (times < self.times[step + 1])
-        if is_inside.any():
-            states[:, is_inside] = self._between(spec, step[is_inside], times[is_inside] - self.times[step[is_inside]])
+        states = self.states[:, np.where(times == self.times[step], step, step + 1)]
         states[:, times > self.times[-1]] = np.nan
+        inside = np.flatnonzero((times > self.times[step]) & (times < self.times[step + 1]))
+        if not inside.size:
+            return states
+        step, solver = step[inside], spec.ride.settings.for_steps_alone
+        time, start, end = self.times[step], self.states[:, step], self.states[:, step + 1]
+        length, whole = times[inside] - time, self.times[step + 1] - time
+        rates = [along(spec, time, start)[: len(start)]]
+        if isinstance(solver, diffrax.AbstractERK):
+            tableau = explicit_tableau(solver)
+            for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
+                stage = start + length * np.tensordot(row, np.stack(rates), 1)
+                rates.append(along(spec, time + fraction * length, stage)[: len(start)])
+            states[:, inside] = start + length * np.tensordot(tableau.b_sol, np.stack(rates), 1)
+        else:
+            # Use the cubic through states and rates at both ends; repeating an implicit step would be expensive.
+            part, change, last = length / whole, end - start, along(spec, time + whole, end)[: len(start)]
+            bend = (1.0 - part) * (whole * rates[0] - change) - part * (whole * last - change)
+            states[:, inside] = start + part * (change + (1.0 - part) * bend)
         return states
 
-    def _between(self, spec: RideSpec, step: Int[np.ndarray, " lanes"], length: Lanes) -> States:
-        """The states at given times [s] after the starts of some steps."""
-        field = functools.partial(in_blocks, _field, spec)
-        time, start, solver = self.times[step], self.states[:, step], spec.ride.settings.for_steps_alone
-        rates = [field(time, start)]
-        if not isinstance(solver, diffrax.AbstractERK):
-            # Use the cubic through states and rates at both ends; repeating an implicit step would be expensive.
-            length_of_step, end = self.times[step + 1] - time, self.states[:, step + 1]
-            part, change = length / length_of_step, end - start
-            last = field(time + length_of_step, end)
-            bend = (1.0 - part) * (length_of_step * rates[0] - change) - part * (length_of_step * last - change)
-            return start + part * (change + (1.0 - part) * bend)
-        tableau = explicit_tableau(solver)
-        for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
-            end = start + length * np.tensordot(row, np.stack(rates), 1)
-            rates.append(field(time + fraction * length, end))
-        return start + length * np.tensordot(tableau.b_sol, np.stack(rates), 1)
+
+#: Quantities that can be watched, and their rows in `along`: the normal force [N], the cosine of the steering angle, and the
+#: relative reduced mass.
+WATCHED = {"normal_force": -3, "steering_cosine": -2, "rank": -1}
 
 
-@eqx.filter_jit
-def _field(spec: RideSpec, times: Float[Array, "*lanes"], states: State) -> State:
-    model = spec.ride.model
-    return model.scene.dynamics.field(times, states, model.input)
-
-
-def in_blocks(function: Callable[..., Array], spec: RideSpec, *columns: np.ndarray) -> np.ndarray:
-    """A compiled function of a ride and any number of columns, `WIDTH` at a time; the last block is padded with its last
-    column."""
-    count = columns[0].shape[-1]
+def along(spec: RideSpec, times: Lanes, states: States) -> Float[np.ndarray, "rows lanes"]:
+    """The rates of any number of states, and below them the quantities in `WATCHED`, by a program for `WIDTH` states at a time;
+    the last block is padded with its last state."""
+    count = len(times)
     results = []
     for first in range(0, count, WIDTH):
         lanes = np.minimum(np.arange(first, first + WIDTH), count - 1)
-        results.append(np.asarray(function(spec, *(column[..., lanes] for column in columns))))
-    return np.concatenate(results, axis=-1)[..., :count]
+        results.append(np.asarray(_along(spec, times[lanes], states[:, lanes])))
+    return np.concatenate(results, axis=-1)[:, :count]
+
+
+@eqx.filter_jit
+def _along(spec: RideSpec, times: Float[Array, " lanes"], states: State) -> Float[Array, "rows lanes"]:
+    model, dynamics = spec.ride.model, spec.ride.model.scene.dynamics
+    watched = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
+    return jnp.stack(jnp.broadcast_arrays(*dynamics.field(times, states, model.input), *watched))
 
 
 def followed(spec: RideSpec) -> tuple[Steps, Stats]:
@@ -317,23 +319,6 @@ def _problem(model: Any) -> RideProblem:
 
 
 _sample = compiled_quickly(sample)
-
-
-#: Quantities that can be watched: the normal force [N], the cosine of the steering angle, and the relative reduced
-#: mass.
-WATCHED = ("normal_force", "steering_cosine", "rank")
-
-
-def watched(spec: RideSpec, states: States, name: str) -> Lanes:
-    """A quantity in `WATCHED` at the given states."""
-    return in_blocks(_watched, spec, states)[WATCHED.index(name)]
-
-
-@eqx.filter_jit
-def _watched(spec: RideSpec, states: State) -> Float[Array, "watched lanes"]:
-    dynamics = spec.ride.model.scene.dynamics
-    quantities = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
-    return jnp.stack(jnp.broadcast_arrays(*quantities))
 
 
 # One run of the stroller and its quantities.
@@ -467,7 +452,7 @@ class Trajectory(AbstractRun):
     def contact_lost_at(self) -> float:
         """Time [s] at which the ground first has to pull on the stroller to keep contact; infinite if there is no such
         time."""
-        force = watched(self.spec, self._all_steps.states, "normal_force")
+        force = along(self.spec, *self._all_steps)[WATCHED["normal_force"]]
         allowed = -CONTACT_ROUND_OFF * np.max(np.abs(force[np.isfinite(force)]), initial=0.0)
         return self._first_below("normal_force", allowed)
 
@@ -483,10 +468,10 @@ class Trajectory(AbstractRun):
 
     def _crossings(self, name: str, level: float) -> tuple[float, Float[np.ndarray, " times"]]:
         """A watched quantity less a level at the start, and the times [s] at which it passes this level."""
-        steps = self._all_steps
-        value = watched(self.spec, steps.states, name) - level
+        steps, row = self._all_steps, WATCHED[name]
+        value = along(self.spec, *steps)[row] - level
         times = all_crossings(
-            lambda times: watched(self.spec, steps.at(self.spec, times), name) - level, steps.times, value
+            lambda times: along(self.spec, times, steps.at(self.spec, times))[row] - level, steps.times, value
         )
         return value[0], times
 

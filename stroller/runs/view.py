@@ -31,7 +31,7 @@ from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 from ..model.dynamics import State
 from ..model.input import Input
 from ..model.scene import DRIVES, Launch, RideProblem, Scene
-from .model import RideModel, check_run
+from .model import RideModel, checked_model
 from .trajectory import MOST_GRIP, QUANTITIES, RideState, Trajectory, names_of
 
 #: JAX's arrays for a page, or NumPy's for a picture.
@@ -267,8 +267,8 @@ def explore(
 
     ```
     """
-    check_run(scene, launch, t1, input, TOLERANCE, jumps)
-    return explore_model(RideModel.of(scene, launch, input, None, jumps), path, sliders, float(t1), unit)
+    model = checked_model(scene, launch, t1, input, TOLERANCE, jumps)
+    return explore_model(model, path, sliders, float(t1), unit)
 
 
 @page_of.register(RideModel)

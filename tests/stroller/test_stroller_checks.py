@@ -9,7 +9,7 @@ import pytest
 
 import stroller
 from stroller import Damping, ImplicitMidpoint, Launch, RollingResistance, Scene, Sphere, Spheroid, Steady, Stroller
-from stroller.runs.model import check_run
+from stroller.runs.model import checked_model
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 FULL = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side="inside", fork="absolute")
@@ -129,9 +129,9 @@ class Hill(eqx.Module):
 def test_the_function_of_a_ground_may_hold_arrays():
     """Only the numbers of the scene itself must be scalars."""
     ground = stroller.Graph(Hill(jnp.array([0.05, 0.1])))
-    check_run(Scene(BODY, ground), Launch((0.1, 0.2), 0.3, 1.0), 1.0, None, 1e-6)
+    checked_model(Scene(BODY, ground), Launch((0.1, 0.2), 0.3, 1.0), 1.0, None, 1e-6)
     with pytest.raises(ValueError, match=r"scene\.gravity must be one number, not of shape"):
-        check_run(Scene(BODY, ground, gravity=[9.8, 1.6]), Launch((0.1, 0.2), 0.3, 1.0), 1.0, None, 1e-6)
+        checked_model(Scene(BODY, ground, gravity=[9.8, 1.6]), Launch((0.1, 0.2), 0.3, 1.0), 1.0, None, 1e-6)
 
 
 @pytest.mark.parametrize(("build", "message"), BAD)

@@ -171,7 +171,7 @@ def test_a_goal_without_a_heading_is_drawn_as_a_cross(parked):
     assert mark.get_marker() == "x"
     assert_close(np.array(mark.get_data()).ravel(), [1.9, 0.3])
     (body,) = [body for show in planned_stage(cross).shows for body in show.bodies if body.name == "goal"]
-    vertices = body.meshes[0].vertices
+    vertices = np.concatenate([mesh.vertices for mesh in body.meshes])
     # The middle is the goal, and the arms are 0.1 wheelbases from it.
     assert_close(vertices.mean(axis=0)[:2], [1.9, 0.3], atol=1e-9)
     assert_close(np.ptp(vertices[:, :2], axis=0), 0.05, atol=0.01)
@@ -196,7 +196,8 @@ def test_a_plan_on_a_curved_ground_is_drawn_in_space(parked, heading):
     if heading is not None:
         assert_close(np.linalg.norm(goal[0] - goal[3]), 1.4 * length, rtol=0.02)
     (body,) = [body for show in planned_stage(plan).shows for body in show.bodies if body.name == "goal"]
-    assert np.linalg.norm(body.meshes[0].vertices - goal.mean(axis=0), axis=1).max() < 1.2 * length
+    vertices = np.concatenate([mesh.vertices for mesh in body.meshes])
+    assert np.linalg.norm(vertices - goal.mean(axis=0), axis=1).max() < 1.2 * length
 
 
 def test_candidates_are_smooth_curves(parked):
