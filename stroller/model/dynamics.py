@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import (
     AbstractSurface,
     Component,
+    Place,
     Plane,
     Vector,
     add,
@@ -104,69 +105,9 @@ class Stroller(Bounded):
             )
 
 
-# What the constraints allow.
+# The equations of motion.
 
 VERTICAL: Vector = (None, None, 1.0)
-
-
-class Heading(eqx.Module):
-    """One of two meanings of "the wheels do not slip sideways" on curved ground; on a plane they are equal.
-
-    In both, the rear axle moves with the velocity w cos(phi) d and the heading turns at the rate w nu sin(phi) / l, where w
-    is the one free speed of the motion. Vectors are in the ground's axes.
-
-    - Intrinsic: the heading is a unit vector e along the ground that turns about the normal: d = e, nu = 1 (section 4).
-    - `projected`: it is a horizontal unit vector h, as in the paper: d = h n_z - z (h.n), nu = n_z (section 3). The velocity
-      along d has the horizontal component n_z h, so the paper's speed is w cos(phi) n_z, which passes through zero at the
-      equator. Where d = 0 the constraints lose rank.
-    """
-
-    projected: bool = eqx.field(static=True)
-
-    def axes(self, ground: AbstractSurface) -> int:
-        """Number of components of the heading that do not vanish identically."""
-        return 2 if self.projected else ground.axes
-
-    def unit(self, heading: Vector, normal: Vector) -> Vector:
-        """The heading, corrected for a drift off the ground or off unit length.
-
-        An exact heading is unchanged, and so is its rate.
-        """
-        if not self.projected:
-            heading = sum_vectors(heading, scale(subtract(None, dot(heading, normal)), normal))
-        return scale(1.0 / jnp.sqrt(dot(heading, heading)), heading)
-
-    def direction(self, heading: Vector, normal: Vector, side: float) -> tuple[Vector, Component, Component]:
-        """The vector d along the ground, its square d.d, and the factor nu, from the outward normal and the side: 1
-        outside, -1 inside."""
-        if not self.projected:
-            return heading, 1.0, 1.0
-        lift = scale(subtract(None, dot(heading, normal)), VERTICAL)
-        direction = scale(side, sum_vectors(scale(normal[2], heading), lift))
-        return direction, dot(direction, direction), multiply(side, normal[2])
-
-    def rate(self, heading: Vector, normal: Vector, normal_rate: Vector, turn: Component, side: float) -> Vector:
-        """Rate [1/s] of a heading that turns at the rate `turn` [rad/s] to the driver's left."""
-        if self.projected:
-            # The driver's left is to the left as seen from above on either side, as in the paper's equations.
-            return cross(scale(turn, VERTICAL), heading)
-        yaw = scale(multiply(side, turn), normal)
-        return cross(sum_vectors(yaw, cross(normal, normal_rate)), heading)
-
-    def at_angle(self, angle: Float[Array, "..."], east: Vector, north: Vector) -> Vector:
-        """The heading at an angle [rad], given the unit vectors of the place."""
-        if self.projected:
-            return (jnp.cos(angle), jnp.sin(angle), None)
-        return sum_vectors(scale(jnp.cos(angle), east), scale(jnp.sin(angle), north))
-
-    def angle(self, heading: Vector, east: Vector, north: Vector) -> Float[Array, "..."]:
-        """The angle [rad] of a heading, in (-pi, pi]."""
-        if self.projected:
-            return jnp.arctan2(heading[1], heading[0])
-        return jnp.arctan2(dot(heading, north), dot(heading, east))
-
-
-# The equations of motion.
 
 
 class Geometry(NamedTuple):
@@ -213,25 +154,60 @@ class Power(NamedTuple):
 
 
 class Dynamics(eqx.Module):
-    """The equations of motion of a scene, for its ground, side, fork and heading.
+    """The equations of motion of a scene, for its ground, side, fork and heading. Vectors are in the ground's axes.
 
-    `up` has the components of the upward vertical in the ground's axes; `side` is 1 outside and -1 inside; `absolute`
-    is 1 if the fork turns with the frame, otherwise `None`.
+    `up` is the upward vertical; `side` is 1 outside and -1 inside; `absolute` is 1 if the fork turns with the frame, otherwise
+    `None`. "The wheels do not slip sideways" has two meanings on curved ground; on a plane they are equal. In both, the rear
+    axle moves with the velocity w cos(phi) d and the heading turns at the rate w nu sin(phi) / l, where w is the one free
+    speed of the motion.
+
+    - Intrinsic: the heading is a unit vector e along the ground that turns about the normal: d = e, nu = 1 (section 4).
+    - `projected`: it is a horizontal unit vector h, as in the paper: d = h n_z - z (h.n), nu = n_z (section 3). The velocity
+      along d has the horizontal component n_z h, so the paper's speed is w cos(phi) n_z, which passes through zero at the
+      equator. Where d = 0 the constraints lose rank.
     """
 
     body: Stroller
     surface: AbstractSurface
     friction: AbstractFriction
     gravity: Float[Array, "..."]
-    heading: Heading
     up: Vector
     side: float = eqx.field(static=True)
+    projected: bool = eqx.field(static=True)
     absolute: float | None = eqx.field(static=True)
+
+    @property
+    def pose_size(self) -> int:
+        """Number of components of a position and a heading that do not vanish identically."""
+        return self.surface.axes + (2 if self.projected else self.surface.axes)
+
+    def pose(self, place: Place, angle: Float[Array, "..."]) -> tuple[Vector, Vector]:
+        """The position of a place, and the heading at an angle [rad] there."""
+        position, east, north = self.surface.chart(place)
+        cosine, sine = jnp.cos(angle), jnp.sin(angle)
+        return position, (cosine, sine, None) if self.projected else sum_vectors(
+            scale(cosine, east), scale(sine, north)
+        )
+
+    def angle(self, position: Vector, heading: Vector) -> Float[Array, "..."]:
+        """The angle [rad] of a heading at a position, in (-pi, pi]."""
+        if self.projected:
+            return jnp.arctan2(heading[1], heading[0])
+        _, east, north = self.surface.chart(self.surface.place_at(position))
+        return jnp.arctan2(dot(heading, north), dot(heading, east))
+
+    def direction(self, heading: Vector, normal: Vector) -> tuple[Vector, Component, Component]:
+        """The vector d along the ground, its square d.d, and the factor nu, from the outward normal."""
+        if not self.projected:
+            return heading, 1.0, 1.0
+        lift = scale(subtract(None, dot(heading, normal)), VERTICAL)
+        direction = scale(self.side, sum_vectors(scale(normal[2], heading), lift))
+        return direction, dot(direction, direction), multiply(self.side, normal[2])
 
     def unpack(self, state: State) -> tuple[Vector, Vector, Float[Array, "others ..."]]:
         """Position, heading and the other components of a state."""
-        place, heading_end = self.surface.axes, self.surface.axes + self.heading.axes(self.surface)
-        return padded(state[:place]), padded(state[place:heading_end]), state[heading_end:]
+        place, end = self.surface.axes, self.pose_size
+        return padded(state[:place]), padded(state[place:end]), state[end:]
 
     def state(
         self,
@@ -249,19 +225,20 @@ class Dynamics(eqx.Module):
         components, which are 0.
         """
         sine, cosine = jnp.sin(steering), jnp.cos(steering)
-        _, square, lead = self.heading.direction(heading, self.surface.normal(position), self.side)
+        _, square, lead = self.direction(heading, self.surface.normal(position))
         momentum = wheel * jnp.sqrt(self.inertia(square, lead, sine, cosine))
         fork_rate = steering_rate
         if self.absolute is not None:
             fork_rate = fork_rate + wheel * lead * sine / self.body.wheelbase
-        vectors = (*position[: self.surface.axes], *heading[: self.heading.axes(self.surface)])
+        place = self.surface.axes
+        vectors = (*position[:place], *heading[: self.pose_size - place])
         start = (*vectors, steering, momentum, fork_rate, sine, cosine)
         example = jnp.broadcast_arrays(*(component for component in start if component is not None))[0]
         return stacked((*start, *(None,) * works), example[None])
 
     def righted(self, state: State) -> State:
         """The state with sin^2 + cos^2 of the steering angle corrected to 1."""
-        first = self.surface.axes + self.heading.axes(self.surface) + 3
+        first = self.pose_size + 3
         sine, cosine = state[first], state[first + 1]
         unit = state[first : first + 2] * (1.0 / jnp.sqrt(sine * sine + cosine * cosine))
         return jnp.concatenate([state[:first], unit, state[first + 2 :]])
@@ -277,8 +254,10 @@ class Dynamics(eqx.Module):
         r, e, rest = self.unpack(state)
         phi, P, fork_rate, sine, cosine = rest[:5]
         n = surface.normal(r)
-        unit = self.heading.unit(e, n)
-        d, square, lead = self.heading.direction(unit, n, side)
+        # The heading, corrected for a drift off the ground or off unit length; an exact one, and its rate, stay unchanged.
+        unit = e if self.projected else sum_vectors(e, scale(subtract(None, dot(e, n)), n))
+        unit = scale(1.0 / jnp.sqrt(dot(unit, unit)), unit)
+        d, square, lead = self.direction(unit, n)
         gauge = 1.0 / jnp.sqrt(self.inertia(square, lead, sine, cosine))
         wheel = P * gauge
         velocity = scale(wheel * cosine, d)
@@ -347,17 +326,23 @@ class Dynamics(eqx.Module):
         pushing = add(multiply(g.cosine, add(forces.drive, drag.rear)), drag.front, multiply(arm, yaw_torque))
         weight_force = multiply(weight, g.cosine, dot(g.direction, self.up))
         momentum_rate = multiply(g.gauge, subtract(multiply(g.lead, pushing), weight_force))
-        heading_rate = self.heading.rate(e, g.normal, g.normal_rate, g.motion.yaw_rate, self.side)
-        power, turn = self.power(g, forces), g.motion.steering_rate
+        if self.projected:
+            # The driver's left is to the left as seen from above on either side, as in the paper's equations.
+            spin = scale(g.motion.yaw_rate, VERTICAL)
+        else:
+            turn = scale(multiply(self.side, g.motion.yaw_rate), g.normal)
+            spin = sum_vectors(turn, cross(g.normal, g.normal_rate))
+        heading_rate, power = cross(spin, e), self.power(g, forces)
+        steering_rate, place = g.motion.steering_rate, self.surface.axes
         return stacked(
             (
-                *g.velocity[: self.surface.axes],
-                *heading_rate[: self.heading.axes(self.surface)],
-                turn,
+                *g.velocity[:place],
+                *heading_rate[: self.pose_size - place],
+                steering_rate,
                 momentum_rate,
                 multiply(torque, 1.0 / body.steering_inertia),
-                multiply(g.cosine, turn),
-                multiply(-g.sine, turn),
+                multiply(g.cosine, steering_rate),
+                multiply(-g.sine, steering_rate),
                 *((power.drive, power.steering) if controls is not None else ()),
                 *((add(*power[2:]),) if self.friction.dissipates else ()),
             ),
@@ -395,7 +380,7 @@ class Dynamics(eqx.Module):
         From the balance of momentum across the heading and of spin about the normal (`stroller.md`, section 4), solved
         without dividing by cos(phi).
         """
-        if self.heading.projected and not isinstance(self.surface, Plane):
+        if self.projected and not isinstance(self.surface, Plane):
             return self._projected_side_force(t, state, controls)
         body = self.body
 

@@ -123,14 +123,11 @@ def check_input(controls: Any, scene: Any, launch: Any, jumps: Any = None) -> No
         raise ValueError(f"{name} must be {WANTED}: {error}") from None
     try:
         shapes = [np.shape(part) for part in jax.eval_shape(controls, t, motion)]
-    except jax.errors.JAXTypeError as error:
-        raise ValueError(
-            f"{name} cannot be traced by JAX: write it with jax.numpy, and jnp.where in place of `if` ({_first_line(error)})"
-        ) from error
     except (TypeError, IndexError) as error:
-        raise ValueError(
-            f"{name} must return (drive force [N], steering torque [N m]) ({_first_line(error)})"
-        ) from error
+        problem = "must return (drive force [N], steering torque [N m])"
+        if isinstance(error, jax.errors.JAXTypeError):
+            problem = "cannot be traced by JAX: write it with jax.numpy, and jnp.where in place of `if`"
+        raise ValueError(f"{name} {problem} ({str(error).strip().splitlines()[0]})") from error
     if shapes != [(), ()]:
         raise ValueError(f"{name} must return one drive force [N] and one steering torque [N m], not shapes {shapes}")
     values = jax.tree.leaves(controls(t, motion))
@@ -140,10 +137,6 @@ def check_input(controls: Any, scene: Any, launch: Any, jumps: Any = None) -> No
     if jumps is None and is_searched(controls):
         remedy = ", or pass the times of the jumps as jumps=[...], which is [] if there are none"
         warn_of_unclear("input(t, motion)", controls, motion, remedy=remedy)
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0]
 
 
 def as_jumps(jumps: Any) -> tuple[Array, ...]:
@@ -174,12 +167,9 @@ def jump_times(
     given times, scalars or (cells,); `t`, `motion`: the types of its arguments, scalars.
     """
     arrays, static = eqx.partition(controls, eqx.is_inexact_array)
-
-    def times_of(arrays: Any) -> Float[Array, " jumps"]:
-        return jumps_of(eqx.combine(arrays, static), t, motion)[0]
-
-    shape = () if cells is None else (cells,)
-    times = in_cells(times_of, arrays, shape) if is_searched(controls) else None
+    shape, times = () if cells is None else (cells,), None
+    if is_searched(controls):
+        times = in_cells(lambda arrays: jumps_of(eqx.combine(arrays, static), t, motion)[0], arrays, shape)
     rows = [*(() if times is None else times), *(jnp.broadcast_to(time, shape) for time in jumps)]
     return jnp.stack(rows) if rows else None
 
@@ -205,12 +195,7 @@ class Formula(eqx.Module):
         return cls(tuple(closed.consts), TracedFunction(jaxpr_as_fun(program), program), is_searched(controls))
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        leaves = jnp.broadcast_arrays(*jax.tree.leaves((t, motion)))
-        run = functools.partial(self.program, *self.held)
-        for _ in range(leaves[0].ndim):
-            run = jax.vmap(run)
-        force, torque = run(*leaves)
-        return force, torque
+        return jnp.vectorize(functools.partial(self.program, *self.held))(*jax.tree.leaves((t, motion)))
 
 
 # Inputs that are written for a single ride, for many rides at once.

@@ -29,7 +29,7 @@ from nonholonomic.validation import (
 )
 
 from ..friction import AbstractFriction, Frictionless, as_law
-from .dynamics import Dynamics, Heading, State, Stroller
+from .dynamics import Dynamics, State, Stroller
 from .input import MOST_ELEMENTS, Formula, Input, PerRide, at_start, jump_times
 
 # Launches: how a ride starts.
@@ -223,9 +223,9 @@ class Scene(Bounded):
             surface=self.surface,
             friction=self.friction,
             gravity=self.gravity,
-            heading=Heading(self.heading == "projected"),
             up=self.surface.up,
             side=self.surface.sign(self.side, DRIVES),
+            projected=self.heading == "projected",
             absolute=FORKS[self.fork],
         )
 
@@ -271,9 +271,8 @@ class Scene(Bounded):
         **Returns:** an array (components, ...) in SI units.
         """
         launch, dynamics = as_one(launch, "launch", Launch), self.dynamics
-        position, east, north = self.surface.chart(launch.place)
-        heading = dynamics.heading.at_angle(launch.heading, east, north)
-        _, _, lead = dynamics.heading.direction(heading, self.surface.normal(position), dynamics.side)
+        position, heading = dynamics.pose(launch.place, launch.heading)
+        _, _, lead = dynamics.direction(heading, self.surface.normal(position))
         wheel = launch.speed / (jnp.cos(launch.steering) * lead)
         works = 2 * driven + self.friction.dissipates
         return dynamics.state(position, heading, launch.steering, launch.steering_rate, wheel, works)
@@ -286,12 +285,12 @@ class Scene(Bounded):
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
-        launch, body, dynamics = as_one(launch, "launch", Launch), self.body, self.dynamics
+        launch, body = as_one(launch, "launch", Launch), self.body
         one = jnp.ones_like(self.state(launch, driven)[0])
         rate = jnp.sqrt(self.gravity / body.wheelbase) + jnp.abs(launch.steering_rate) + 1e-3
         rate = rate + jnp.abs(launch.speed) / body.wheelbase
         speed = rate * body.wheelbase
-        places, headings = self.surface.axes, dynamics.heading.axes(self.surface)
+        places, headings = self.surface.axes, self.dynamics.pose_size - self.surface.axes
         motion = (one, jnp.sqrt(body.mass) * speed, rate, one, one)
         work_components = (body.mass * speed**2,) * (2 * driven + self.friction.dissipates)
         return stacked((*(body.wheelbase,) * places, *(one,) * headings, *motion, *work_components), one[None])
@@ -302,8 +301,7 @@ class Scene(Bounded):
 
     def work(self, state: State) -> Float[Array, "..."]:
         """Work [J] done on the stroller so far by its inputs and by friction; negative if they took energy."""
-        first = self.surface.axes + self.dynamics.heading.axes(self.surface) + 5
-        return jnp.sum(state[first:], axis=0)
+        return jnp.sum(state[self.dynamics.pose_size + 5 :], axis=0)
 
     def contact(self, state: State) -> Float[Array, "..."]:
         """Normal force [N] of the ground on the stroller; negative where the ground would have to pull."""

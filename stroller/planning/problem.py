@@ -413,9 +413,8 @@ def corners_of(dynamics: Dynamics, footprint: Footprint, pose: Float[Array, "com
 @eqx.filter_jit
 def pose_of(scene: Scene, place: tuple[ArrayLike, ...], heading: Float[Array, ""]) -> Pose:
     """A position and a heading [rad], in the ground's axes, as one array."""
-    position, east, north = scene.surface.chart(place)
-    direction = scene.dynamics.heading.at_angle(heading, east, north)
-    return jnp.stack([*position[: scene.surface.axes], *direction[: scene.surface.axes]])
+    axes = scene.surface.axes
+    return jnp.stack([component for vector in scene.dynamics.pose(place, heading) for component in vector[:axes]])
 
 
 @eqx.filter_jit

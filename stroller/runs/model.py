@@ -43,7 +43,7 @@ from ..friction import Damping, RollingResistance
 from ..model.dynamics import Stroller
 from ..model.input import Formula, Input, PerRide, Steady, as_jumps, at_start, check_input
 from ..model.scene import USUAL, Launch, RideProblem, Scene, as_module, has_arrays
-from .trajectory import QUANTITIES, TIMED, VECTORS, RideState, Trajectory, heading, ride
+from .trajectory import QUANTITIES, TIMED, VECTORS, RideState, Trajectory, ride
 
 #: Names of the coordinates of a place in the fixed frame.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
@@ -215,7 +215,7 @@ class RideModel(AbstractSceneModel):
         energy = scene.energy(states)
         position = surface.in_fixed_frame(motion.position)
         return dict(zip("xyz", position, strict=True)) | {
-            "heading": heading(scene, motion),
+            "heading": scene.dynamics.angle(motion.position, motion.heading),
             "end_steering": motion.steering,
             "end_speed": motion.speed,
             "energy": energy,

@@ -33,7 +33,7 @@ from nonholonomic.validation import (
 )
 
 from ..model.dynamics import Geometry, Power, State, padded
-from ..model.input import Input, Motion
+from ..model.input import Input
 from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, RideProblem, Scene
 
 # The quantities of a ride, with units and names, as functions of its states, and the table of a run.
@@ -96,7 +96,7 @@ QUANTITIES = {
         "component",
         lambda state: state.vector(state.scene.surface.in_fixed_frame(state.geometry.motion.heading)),
     ),
-    "heading": Quantity("rad", "heading ψ", None, lambda state: heading(state.scene, state.geometry.motion)),
+    "heading": Quantity("rad", "heading ψ", None, lambda state: state.scene.dynamics.angle(*state.geometry.motion[:2])),
     "steering": Quantity("rad", "steering angle φ", None, lambda state: state.geometry.motion.steering),
     "steering_rate": Quantity("rad s-1", "φ'", None, lambda state: state.number(state.geometry.motion.steering_rate)),
     "speed": Quantity("m s-1", "speed v", None, lambda state: state.geometry.motion.speed),
@@ -130,12 +130,6 @@ VECTORS = {"component": ("x", "y", "z"), "axle": ("rear", "front")}
 #: The coefficient of friction [1] that no tyre exceeds on a dry road: 0.7 to 1.0 is usual, and 1.8 is that of racing slicks
 #: (Milliken and Milliken, Race Car Vehicle Dynamics (1995), chapter 2).
 MOST_GRIP = 1.8
-
-
-def heading(scene: Scene, motion: Motion) -> Float[Array, "..."]:
-    """The heading [rad] in the surface's own coordinates."""
-    _, east, north = scene.surface.chart(scene.surface.place_at(motion.position))
-    return scene.dynamics.heading.angle(motion.heading, east, north)
 
 
 def grip(side_force: Float[Array, "... 2"], load: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
@@ -290,7 +284,9 @@ def along(spec: RideSpec, times: Lanes, states: States) -> Float[np.ndarray, "ro
 
 
 @eqx.filter_jit
-def _along(spec: RideSpec, times: Float[Array, " lanes"], states: State) -> Float[Array, "rows lanes"]:
+def _along(
+    spec: RideSpec, times: Float[Array | np.ndarray, " lanes"], states: Float[Array | np.ndarray, "components lanes"]
+) -> Float[Array, "rows lanes"]:
     model, dynamics = spec.ride.model, spec.ride.model.scene.dynamics
     watched = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
     return jnp.stack(jnp.broadcast_arrays(*dynamics.field(times, states, model.input), *watched))

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeAlias
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +35,7 @@ from .model import RideModel, checked_model
 from .trajectory import MOST_GRIP, QUANTITIES, RideState, Trajectory, names_of
 
 #: JAX's arrays for a page, or NumPy's for a picture.
-Values: TypeAlias = Array | np.ndarray
+Values = TypeVar("Values", Array, np.ndarray)
 
 # The drawing of a ride: the vehicle, the traces of its wheels, forces, and curves over time.
 
@@ -96,7 +96,7 @@ def ground_of(rides: list[Trajectory], normal: np.ndarray) -> views.Arena:
 
 
 def drawn(
-    xp: ModuleType, scene: Scene, values: dict[str, Any], angles: Sequence[Values] | Values
+    xp: ModuleType, scene: Scene, values: dict[str, Values], angles: Sequence[Values] | Values
 ) -> tuple[Values, list[tuple[Values, Values]], list[Values], list[tuple[Values, Values]]]:
     """What is drawn of a vehicle: the ground's normal towards it; the place and the rotation of each of `PARTS`; the points of
     `TRACES`; and start and vector of each of `FORCES`.
@@ -175,7 +175,7 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
     )
 
 
-def refined(run: Trajectory, radius: float) -> tuple[np.ndarray, Callable[[Values], np.ndarray]]:
+def refined(run: Trajectory, radius: float) -> tuple[np.ndarray, Callable[[Array | np.ndarray], np.ndarray]]:
     """Times so close that the wheels roll little between them, including the times of the ride, and a function that
     returns the ride's numbers at these times."""
     times = np.asarray(run.t)

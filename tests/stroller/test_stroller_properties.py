@@ -169,8 +169,8 @@ def check_a_batch(scene: Scene, launch: Launch, knots, kink):
 
 def signs_of(scene: Scene, place, heading, remainder):
     """A column of signs for the components of a state."""
-    heading_axes = scene.dynamics.heading.axes(scene.surface)
-    return np.array([*place[: scene.surface.axes], *heading[:heading_axes], *remainder])[:, None]
+    axes = scene.surface.axes
+    return np.array([*place[:axes], *heading[: scene.dynamics.pose_size - axes], *remainder])[:, None]
 
 
 def check_mirror(scene: Scene, launch: Launch):

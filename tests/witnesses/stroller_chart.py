@@ -141,9 +141,7 @@ class Chart(AbstractSystem):
     def motion(self, q: Coordinates, wheels: WheelMotion) -> Motion:
         """The motion for an input."""
         place = (q[0], q[1]) if self.quadric is None else (q[1], q[0])
-        position, east, north = self.scene.surface.chart(place)
-        heading = self.scene.dynamics.heading.at_angle(q[2], east, north)
-        return Motion(position, heading, q[3], *wheels[:4])
+        return Motion(*self.scene.dynamics.pose(place, q[2]), q[3], *wheels[:4])
 
     def force(self, t: Float[Array, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
         rows, wheels = self.wheel_motion(q, rate)
@@ -157,9 +155,8 @@ def coordinates(scene: Scene, state: State) -> Coordinates:
     """Coordinates q of a state (components,) of the P-form."""
     position, heading, rest = scene.dynamics.unpack(state)
     place = scene.surface.place_at(position)
-    _, east, north = scene.surface.chart(place)
     first = place if isinstance(scene.surface, Plane) else place[::-1]
-    return jnp.stack([*first, scene.dynamics.heading.angle(heading, east, north), rest[0]])
+    return jnp.stack([*first, scene.dynamics.angle(position, heading), rest[0]])
 
 
 def coordinates_and_rates(
