@@ -133,15 +133,6 @@ class Geometry(NamedTuple):
     rear_load: Component
 
 
-class Forces(NamedTuple):
-    """Drive force [N] and steering torque [N m] of the input, the friction, and the total torque [N m] on the fork."""
-
-    drive: Component
-    torque: Component
-    drag: Drag
-    fork: Component
-
-
 class Power(NamedTuple):
     """Power [W] through each port: of the drive, of the steering torque, and of each kind of friction."""
 
@@ -151,6 +142,17 @@ class Power(NamedTuple):
     front: Component
     yaw: Component
     fork: Component
+
+
+class Forces(NamedTuple):
+    """Drive force [N] and steering torque [N m] of the input, the friction, the total torque [N m] on the fork, and the power
+    of each."""
+
+    drive: Component
+    torque: Component
+    drag: Drag
+    fork: Component
+    power: Power
 
 
 class Dynamics(eqx.Module):
@@ -297,19 +299,15 @@ class Dynamics(eqx.Module):
         speeds = (motion.speed, motion.front_speed, motion.yaw_rate, motion.steering_rate)
         drag = self.friction.drag(WheelMotion(*speeds, geometry.rear_load, geometry.front_load))
         spring = multiply(self.body.steering_spring, motion.steering)
-        return Forces(drive, torque, drag, subtract(add(torque, drag.steering), spring))
-
-    def power(self, geometry: Geometry, forces: Forces) -> Power:
-        """Power [W] through each port."""
-        motion, drag = geometry.motion, forces.drag
-        return Power(
-            drive=multiply(forces.drive, motion.speed),
-            steering=multiply(forces.torque, motion.steering_rate),
+        power = Power(
+            drive=multiply(drive, motion.speed),
+            steering=multiply(torque, motion.steering_rate),
             rear=multiply(drag.rear, motion.speed),
             front=multiply(drag.front, motion.front_speed),
             yaw=multiply(drag.yaw, motion.yaw_rate),
             fork=multiply(drag.steering, motion.steering_rate),
         )
+        return Forces(drive, torque, drag, subtract(add(torque, drag.steering), spring), power)
 
     def field(self, t: Float[Array, "..."], state: State, controls: Input | None = None) -> State:
         """Rate of change of the state, (components, ...)."""
@@ -332,7 +330,7 @@ class Dynamics(eqx.Module):
         else:
             turn = scale(multiply(self.side, g.motion.yaw_rate), g.normal)
             spin = sum_vectors(turn, cross(g.normal, g.normal_rate))
-        heading_rate, power = cross(spin, e), self.power(g, forces)
+        heading_rate, power = cross(spin, e), forces.power
         steering_rate, place = g.motion.steering_rate, self.surface.axes
         return stacked(
             (

@@ -127,8 +127,8 @@ class Planner(eqx.Module):
         parts = [jnp.stack([*lengths, *turned]), known, *own, each.sum(axis=0), each.max(axis=0, initial=0.0)]
         return self.of_step(jnp.concatenate(parts).astype(jnp.float32)).astype(float)
 
-    def propose(self, task: Task, t1: Numbers, number: Int[Array, ""]) -> Proposal:
-        """One of the proposals for a problem."""
+    def propose(self, task: Task, t1: Numbers, number: Int[Array, ""]) -> tuple[Numbers, Proposal]:
+        """One of the proposals for a problem, and its merit before it."""
         pose, steering, steering_rate, front_speed = task.start
         duration, change = t1 / DECISIONS, jnp.array([-1.0, 0.0, 1.0])
         low, high, speed = task.low[0], task.high[0], task.speed
@@ -154,17 +154,13 @@ class Planner(eqx.Module):
 
         first = jnp.stack([steering + steering_rate * duration * change, front_speed + 0.0 * change], axis=1)
         (end, _), (rows, poses) = jax.lax.scan(jax.checkpoint(decision), (pose, first), jnp.arange(DECISIONS))
-        return Proposal(jnp.concatenate([first, rows]), poses, end)
+        proposal = Proposal(jnp.concatenate([first, rows]), poses, end)
+        return merit(task, proposal, t1), proposal
 
     @eqx.filter_jit
     def proposals(self, task: Task, t1: Numbers) -> tuple[Float[Array, " proposals"], Proposal]:
         """The merits of all proposals for a problem, and the proposals."""
-
-        def of_one(number: Int[Array, ""]) -> tuple[Numbers, Proposal]:
-            proposal = self.propose(task, t1, number)
-            return merit(task, proposal, t1), proposal
-
-        return jax.vmap(of_one)(jnp.arange(PROPOSALS))
+        return jax.vmap(self.propose, (None, None, 0))(task, t1, jnp.arange(PROPOSALS))
 
 
 def merit(task: Task, proposal: Proposal, t1: Numbers) -> Numbers:

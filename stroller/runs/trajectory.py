@@ -32,7 +32,7 @@ from nonholonomic.validation import (
     times_within,
 )
 
-from ..model.dynamics import Geometry, Power, State, padded
+from ..model.dynamics import Power, State, padded
 from ..model.input import Input
 from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, RideProblem, Scene
 
@@ -46,16 +46,16 @@ class RideState:
     def __init__(self, scene: Scene, controls: Input | None, t: Float[Array, "..."], states: State):
         self.scene, self.controls, self.t = scene, controls, t
         self.integrated, self.states = states, scene.dynamics.righted(states)
-
-    @functools.cached_property
-    def geometry(self) -> Geometry:
-        return self.scene.dynamics.geometry(self.states)
+        self.geometry = scene.dynamics.geometry(self.states)
+        self.motion, surface = self.geometry.motion, scene.surface
+        # Vectors in the fixed frame, and the numbers of the place.
+        self.position, self.direction = (surface.in_fixed_frame(vector) for vector in self.motion[:2])
+        self.place = surface.place_at(self.motion.position)
 
     @functools.cached_property
     def power(self) -> Power:
-        dynamics, geometry = self.scene.dynamics, self.geometry
-        power = dynamics.power(geometry, dynamics.forces(self.t, geometry, self.controls))
-        return Power(*(self.number(part) for part in power))
+        forces = self.scene.dynamics.forces(self.t, self.geometry, self.controls)
+        return Power(*(self.number(part) for part in forces.power))
 
     @functools.cached_property
     def load(self) -> Float[Array, "... 2"]:
@@ -78,30 +78,15 @@ class RideState:
 
 #: The quantities of a ride; `read` gets a `RideState`.
 QUANTITIES = {
-    "place": Quantity(
-        "m or rad",
-        "place",
-        "coordinate",
-        lambda state: state.vector(state.scene.surface.place_at(state.geometry.motion.position)),
-    ),
-    "position": Quantity(
-        "m",
-        "position of the rear axle",
-        "component",
-        lambda state: state.vector(state.scene.surface.in_fixed_frame(state.geometry.motion.position)),
-    ),
-    "direction": Quantity(
-        "1",
-        "direction of the heading",
-        "component",
-        lambda state: state.vector(state.scene.surface.in_fixed_frame(state.geometry.motion.heading)),
-    ),
-    "heading": Quantity("rad", "heading ψ", None, lambda state: state.scene.dynamics.angle(*state.geometry.motion[:2])),
-    "steering": Quantity("rad", "steering angle φ", None, lambda state: state.geometry.motion.steering),
-    "steering_rate": Quantity("rad s-1", "φ'", None, lambda state: state.number(state.geometry.motion.steering_rate)),
-    "speed": Quantity("m s-1", "speed v", None, lambda state: state.geometry.motion.speed),
-    "front_speed": Quantity("m s-1", "speed of the front wheel", None, lambda state: state.geometry.motion.front_speed),
-    "yaw_rate": Quantity("rad s-1", "yaw rate", None, lambda state: state.geometry.motion.yaw_rate),
+    "place": Quantity("m or rad", "place", "coordinate", lambda state: state.vector(state.place)),
+    "position": Quantity("m", "position of the rear axle", "component", lambda state: state.vector(state.position)),
+    "direction": Quantity("1", "direction of the heading", "component", lambda state: state.vector(state.direction)),
+    "heading": Quantity("rad", "heading ψ", None, lambda state: state.scene.dynamics.angle(*state.motion[:2])),
+    "steering": Quantity("rad", "steering angle φ", None, lambda state: state.motion.steering),
+    "steering_rate": Quantity("rad s-1", "φ'", None, lambda state: state.number(state.motion.steering_rate)),
+    "speed": Quantity("m s-1", "speed v", None, lambda state: state.motion.speed),
+    "front_speed": Quantity("m s-1", "speed of the front wheel", None, lambda state: state.motion.front_speed),
+    "yaw_rate": Quantity("rad s-1", "yaw rate", None, lambda state: state.motion.yaw_rate),
     "energy": Quantity("J", "energy", None, lambda state: state.scene.energy(state.states)),
     "work": Quantity("J", "work of inputs and friction", None, lambda state: state.scene.work(state.states)),
     "drive_power": Quantity("W", "power of the drive", None, lambda state: state.power.drive),
@@ -117,7 +102,7 @@ QUANTITIES = {
 FURTHER: dict[str, Callable[[RideState], PyTree[Array]]] = {
     "power": lambda state: state.power,
     "constraint": lambda state: state.vector(side_slip(state)),
-    "departure": lambda state: state.number(state.scene.surface.offset(state.geometry.motion.position)),
+    "departure": lambda state: state.number(state.scene.surface.offset(state.motion.position)),
     "state": lambda state: jnp.moveaxis(state.integrated, 0, -1),
 }
 
@@ -396,9 +381,9 @@ class Trajectory(AbstractRun):
         the radii of curvature.
         """
         scene = self.model.scene
-        state = RideState(scene, None, self.t, self.state.T)
-        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(state.integrated)[0])
-        return jnp.abs(state.number(curvature)) * scene.body.wheelbase**2 / 6.0
+        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(self.state.T)[0])
+        error = 0.0 if curvature is None else jnp.abs(curvature) * scene.body.wheelbase**2 / 6.0
+        return jnp.broadcast_to(error, self.t.shape)
 
     def grip(self) -> Float[Array, "times 2"]:
         """Coefficient of friction that each axle needs to avoid slip; infinite for a force without a load."""
