@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.geometry import AbstractSurface, Plane, cross, difference, dot, scale
+from nonholonomic.geometry import AbstractSurface, Plane
 from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit, shown
 from nonholonomic.validation import require_file, require_flag, require_kind, require_package, require_whole
@@ -20,38 +20,13 @@ from nonholonomic.views.plot import new_figure
 from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
 from ..model.dynamics import Dynamics, padded
-from ..model.input import Motion
 from ..model.scene import Launch, Scene
 from ..runs.model import simulate
 from ..runs.trajectory import Trajectory
 from .planner import Planner, proposed
-from .problem import (
-    MOST_STEERING,
-    Box,
-    Disc,
-    Footprint,
-    Goal,
-    Limits,
-    Points,
-    Problem,
-    checked_problem,
-    corners_of,
-    frame_of,
-)
+from .problem import Box, Disc, Footprint, Goal, Limits, Points, Problem, checked_problem, corners_of, frame_of
 from .search import INTERVALS, guess_of, paths_of, prices
-from .transcription import (
-    FINE,
-    LIMIT_RESERVE,
-    ORDER,
-    Candidates,
-    Drive,
-    Numbers,
-    Task,
-    drive_along,
-    evaluate,
-    interpolate,
-    optimise,
-)
+from .transcription import FINE, LIMIT_RESERVE, Candidates, Drive, Task, Tracker, drive_along, interpolate, optimise
 
 # The result of a plan.
 
@@ -464,54 +439,6 @@ REACH, CATCHING_UP = 2.0, 0.8
 SLOW = 0.1
 
 
-class Tracker(eqx.Module):
-    """An input that follows a plan and corrects errors of place and heading; `track` returns it.
-
-    - `drive`: the input of the plan; `pose`: splines of the planned position and heading in the ground's axes;
-    - `across` [1/m^2], `turning` [1/m], `along` [1/s]: stiffness k and dampings d and c of the shaped energy;
-    - `least_steering`, `most_steering` [rad]: bounds of the steering angle;
-    - `slow` [m/s]: speed below which the damping d fades out.
-    """
-
-    drive: Drive
-    pose: Float[Array, "fine components"]
-    surface: AbstractSurface
-    wheelbase: Float[Array, ""]
-    across: Float[Array, ""]
-    turning: Float[Array, ""]
-    along: Float[Array, ""]
-    least_steering: Float[Array, ""]
-    most_steering: Float[Array, ""]
-    slow: Float[Array, ""]
-    side: float = eqx.field(static=True)
-
-    def errors(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers, Numbers, Numbers]:
-        """The planned stroller as seen from this one: distances [m] ahead and to the left, and the sine and the cosine of
-        the angle to the left at which it heads."""
-        pose = evaluate(self.pose, jnp.asarray(t) / self.drive.duration)
-        components = jnp.moveaxis(pose, -1, 0)
-        axes = self.surface.axes
-        heading, target = padded(components[axes:]), padded(components[:axes])
-        left = scale(self.side, cross(self.surface.normal(motion.position), motion.heading))
-        away = difference(target, motion.position)
-        return dot(away, motion.heading), dot(away, left), dot(heading, left), dot(heading, motion.heading)
-
-    def storage(self, t: Numbers, motion: Motion) -> Numbers:
-        """The shaped energy of the errors of place and heading [m^2]: (x^2 + y^2) / 2 + (1 - cos(angle)) / stiffness."""
-        ahead, left, _, cosine = self.errors(t, motion)
-        return 0.5 * (ahead**2 + left**2) + (1.0 - cosine) / self.across
-
-    def __call__(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers]:
-        angle, rate, front_speed, force, torque = self.drive.reference(t)
-        ahead, left, sine, cosine = self.errors(t, motion)
-        speed = front_speed * jnp.cos(angle)
-        turn = self.across * left + self.turning * jnp.tanh(speed / self.slow) * sine
-        steering = jnp.arctan(jnp.tan(angle) + self.wheelbase * turn)
-        steering = jnp.clip(steering, self.least_steering, self.most_steering)
-        wanted = (speed * cosine + self.along * ahead) / jnp.cos(steering)
-        return self.drive.held(motion, steering, rate, wanted, force, torque)
-
-
 def track(scene: Scene, plan: Plan) -> Tracker:
     """Feedback that keeps a ride on its plan under disturbances.
 
@@ -557,10 +484,10 @@ def track(scene: Scene, plan: Plan) -> Tracker:
             f"scene: its ground is a {type(scene.surface).__name__} and must be a {planned_on.__name__}, as in the plan"
         )
     run, axes = plan.run, scene.surface.axes
-    nodes = FINE * (len(plan.input.steering) - ORDER + 1) + 1
-    poses = CubicSpline(np.asarray(run.t), np.asarray(run.state[:, : 2 * axes]))(np.linspace(0.0, plan.t1, nodes))
+    nodes = np.linspace(0.0, plan.t1, FINE * INTERVALS + 1)
+    poses = CubicSpline(np.asarray(run.t), np.asarray(run.state[:, : 2 * axes]))(nodes)
     length = scene.body.wheelbase
-    low, high = plan.problem.limits.ranges().get("steering", (-MOST_STEERING, MOST_STEERING))
+    lowest, highest = plan.problem.limits.arrays(0.0)
     return Tracker(
         drive=plan.input,
         pose=jnp.asarray(interpolate(poses)),
@@ -569,8 +496,8 @@ def track(scene: Scene, plan: Plan) -> Tracker:
         across=1.0 / (REACH * length) ** 2,
         turning=2.0 / (REACH * length),
         along=jnp.asarray(CATCHING_UP),
-        least_steering=jnp.asarray(low),
-        most_steering=jnp.asarray(high),
+        least_steering=jnp.asarray(lowest[0]),
+        most_steering=jnp.asarray(highest[0]),
         slow=SLOW * length,
         side=scene.dynamics.side,
     )

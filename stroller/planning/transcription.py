@@ -18,7 +18,7 @@ import scipy.linalg
 from jaxtyping import Array, Float, Int
 from scipy.interpolate import make_interp_spline
 
-from nonholonomic.geometry import Vector, add, dot, multiply, scale, subtract
+from nonholonomic.geometry import AbstractSurface, Vector, add, cross, difference, dot, multiply, scale, subtract
 
 from ..model.dynamics import Dynamics, padded
 from ..model.input import Motion
@@ -479,7 +479,8 @@ def optimise(candidates: Candidates, task: Task, firmness: float = 1.0) -> tuple
     return candidates, violation, values
 
 
-# The input of a plan: a force and a torque over time, and feedback that holds the planned speed and steering angle.
+# The inputs of a plan: a force and a torque over time, with feedback that holds the planned speed and steering angle, and with
+# feedback that also corrects the place.
 
 #: How fast feedback removes an error of the steering angle and of the speed [1/s].
 STEERING_RATE, SPEED_RATE = 8.0, 4.0
@@ -569,3 +570,51 @@ def drive_along(dynamics: Dynamics, pose: Pose, coefficients: Float[Array | np.n
         angle_gain=STEERING_RATE**2 * body.steering_inertia,
         rate_gain=2.0 * STEERING_RATE * body.steering_inertia,
     )
+
+
+class Tracker(eqx.Module):
+    """An input that follows a plan and corrects errors of place and heading; `track` returns it.
+
+    - `drive`: the input of the plan; `pose`: splines of the planned position and heading in the ground's axes;
+    - `across` [1/m^2], `turning` [1/m], `along` [1/s]: stiffness k and dampings d and c of the shaped energy;
+    - `least_steering`, `most_steering` [rad]: bounds of the steering angle;
+    - `slow` [m/s]: speed below which the damping d fades out.
+    """
+
+    drive: Drive
+    pose: Float[Array, "fine components"]
+    surface: AbstractSurface
+    wheelbase: Float[Array, ""]
+    across: Float[Array, ""]
+    turning: Float[Array, ""]
+    along: Float[Array, ""]
+    least_steering: Float[Array, ""]
+    most_steering: Float[Array, ""]
+    slow: Float[Array, ""]
+    side: float = eqx.field(static=True)
+
+    def errors(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+        """The planned stroller as seen from this one: distances [m] ahead and to the left, and the sine and the cosine of
+        the angle to the left at which it heads."""
+        pose = evaluate(self.pose, jnp.asarray(t) / self.drive.duration)
+        components = jnp.moveaxis(pose, -1, 0)
+        axes = self.surface.axes
+        heading, target = padded(components[axes:]), padded(components[:axes])
+        left = scale(self.side, cross(self.surface.normal(motion.position), motion.heading))
+        away = difference(target, motion.position)
+        return dot(away, motion.heading), dot(away, left), dot(heading, left), dot(heading, motion.heading)
+
+    def storage(self, t: Numbers, motion: Motion) -> Numbers:
+        """The shaped energy of the errors of place and heading [m^2]: (x^2 + y^2) / 2 + (1 - cos(angle)) / stiffness."""
+        ahead, left, _, cosine = self.errors(t, motion)
+        return 0.5 * (ahead**2 + left**2) + (1.0 - cosine) / self.across
+
+    def __call__(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers]:
+        angle, rate, front_speed, force, torque = self.drive.reference(t)
+        ahead, left, sine, cosine = self.errors(t, motion)
+        speed = front_speed * jnp.cos(angle)
+        turn = self.across * left + self.turning * jnp.tanh(speed / self.slow) * sine
+        steering = jnp.arctan(jnp.tan(angle) + self.wheelbase * turn)
+        steering = jnp.clip(steering, self.least_steering, self.most_steering)
+        wanted = (speed * cosine + self.along * ahead) / jnp.cos(steering)
+        return self.drive.held(motion, steering, rate, wanted, force, torque)
