@@ -195,7 +195,11 @@ class Formula(eqx.Module):
         return cls(tuple(closed.consts), TracedFunction(jaxpr_as_fun(program), program), is_searched(controls))
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        return jnp.vectorize(functools.partial(self.program, *self.held))(*jax.tree.leaves((t, motion)))
+        leaves = jnp.broadcast_arrays(*jax.tree.leaves((t, motion)))
+        run = functools.partial(self.program, *self.held)
+        for _ in range(leaves[0].ndim):
+            run = jax.vmap(run)
+        return tuple(run(*leaves))
 
 
 # Inputs that are written for a single ride, for many rides at once.
