@@ -257,28 +257,26 @@ class PerRide(eqx.Module):
             controls = eqx.combine(jax.tree.unflatten(of_numbers, numbers), static)
             return tuple(controls(*jax.tree.unflatten(structure, moving)))
 
-        shapes = [number.shape[:-1] for number in numbers]
-        if self.by_elements:
-            return _by_elements(of_ride, numbers, shapes, moving)
-        own = jax.tree.map(lambda part: jax.ShapeDtypeStruct(part.shape[:-1], part.dtype), (numbers, moving))
-        with contextlib.suppress(TooLarge):
-            return over_last_axis(of_ride, *own)(numbers, moving)
-        axes = [-1 if number.ndim else None for number in numbers]
-        return jax.vmap(of_ride, in_axes=(axes, 0))(numbers, moving)
+        if not self.by_elements:
+            own = jax.tree.map(lambda part: jax.ShapeDtypeStruct(part.shape[:-1], part.dtype), (numbers, moving))
+            with contextlib.suppress(TooLarge):
+                return over_last_axis(of_ride, *own)(numbers, moving)
+            axes = [-1 if number.ndim else None for number in numbers]
+            return jax.vmap(of_ride, in_axes=(axes, 0))(numbers, moving)
 
+        def of_elements(elements: list[list[Array]], moving: list[Array]) -> Any:
+            shapes = [number.shape[:-1] for number in numbers]
+            return of_ride(
+                [jnp.stack(part).reshape(shape) for part, shape in zip(elements, shapes, strict=True)], moving
+            )
 
-def _by_elements(of_ride: Any, numbers: list[Array], shapes: list[tuple[int, ...]], moving: list[Array]) -> Any:
-    """The input with every number of an array as a vector of rides."""
-
-    def of_elements(elements: list[list[Array]], moving: list[Array]) -> Any:
-        return of_ride([jnp.stack(part).reshape(shape) for part, shape in zip(elements, shapes, strict=True)], moving)
-
-    elements = []
-    for number in numbers:
-        flat = number.reshape(-1, *number.shape[-1:])
-        # This operation's derivative joins all elements at once.
-        split = [number] if number.ndim == 0 else [row[0] for row in jax.lax.split(flat, (1,) * len(flat))]
-        elements.append(split)
-    scalars = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), (elements, moving))
-    results = by_components(of_elements, *scalars)(elements, moving)
-    return jax.tree.map(lambda part: jnp.broadcast_to(part, moving[0].shape), results)
+        # Every number of an array is a vector of rides.
+        elements = []
+        for number in numbers:
+            flat = number.reshape(-1, *number.shape[-1:])
+            # This operation's derivative joins all elements at once.
+            split = [number] if number.ndim == 0 else [row[0] for row in jax.lax.split(flat, (1,) * len(flat))]
+            elements.append(split)
+        scalars = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), (elements, moving))
+        results = by_components(of_elements, *scalars)(elements, moving)
+        return jax.tree.map(lambda part: jnp.broadcast_to(part, moving[0].shape), results)

@@ -233,32 +233,30 @@ class Scene(Bounded):
         """Raise `ValueError` if the scene cannot start with the launch."""
         require_kind(launch, "launch", Launch)
         require_all(self.surface.place_bounds(launch.place, self.body.wheelbase))
-        if not is_traced(stuck := self.sideways(launch)) and np.any(stuck):
+        sideways, on_equator = self.stuck(launch)
+        if not is_traced(sideways) and np.any(sideways):
             raise ValueError(
                 f"steering = {shown(launch.steering)} must differ from a right angle for speed = {shown(launch.speed)}: "
                 "the rear axle cannot move while the front wheel is at a right angle"
             )
-        if not is_traced(on_equator := self.level(launch)) and np.any(on_equator):
+        if not is_traced(on_equator) and np.any(on_equator):
             raise ValueError(
                 f"place[1] = {shown(launch.place[1])} must differ from 0 for heading = 'projected': on the equator, motion "
                 "along the ground has no horizontal speed, and the constraints may lose rank"
             )
 
-    def sideways(self, launch: Launch) -> Condition:
-        """Whether a launch has a speed although its front wheel is at a right angle; a concrete value for a concrete
-        launch."""
-        steering, speed = launch.steering, launch.speed
+    def stuck(self, launch: Launch) -> tuple[Condition, Condition]:
+        """Whether a launch has a speed although its front wheel is at a right angle, and whether it is on the equator with a
+        projected heading; concrete values for a concrete launch."""
+        steering, speed, last = launch.steering, launch.speed, launch.place[-1]
         xp = jnp if is_traced(steering) or is_traced(speed) else np
-        return (xp.abs(xp.cos(xp.asarray(steering))) < RIGHT_ANGLE) & (xp.asarray(speed) != 0.0)
-
-    def level(self, launch: Launch) -> Condition:
-        """Whether a launch with a projected heading is on the equator; a concrete value for a concrete launch."""
+        sideways = (xp.abs(xp.cos(xp.asarray(steering))) < RIGHT_ANGLE) & (xp.asarray(speed) != 0.0)
         if self.heading != "projected" or not isinstance(self.surface, AbstractQuadric):
-            return False
-        polar, last = self.surface.semi_axes[1], launch.place[-1]
+            return sideways, False
+        polar = self.surface.semi_axes[1]
         xp = jnp if is_traced(last) or is_traced(polar) else np
         sine = xp.sin(xp.asarray(last)) if len(launch.place) == 2 else xp.asarray(last) / xp.asarray(polar)
-        return xp.abs(sine) < RIGHT_ANGLE
+        return sideways, xp.abs(sine) < RIGHT_ANGLE
 
     def state(self, launch: Launch, driven: bool = False) -> State:
         """The state at the start of a run (see `dynamics.py` for its components).

@@ -165,8 +165,9 @@ class RideModel(AbstractSceneModel):
     def legal(self) -> Bool[Array, "..."]:
         scene, launch = self.scene, self.launch
         bounds = [bound for module in (scene, launch, self.input) for bound in all_bounds(module)]
-        is_stuck = jnp.asarray(scene.sideways(launch) | scene.level(launch))
-        return legal([*bounds, *scene.surface.place_bounds(launch.place, scene.body.wheelbase)]) & ~is_stuck
+        bounds += scene.surface.place_bounds(launch.place, scene.body.wheelbase)
+        sideways, on_equator = scene.stuck(launch)
+        return legal(bounds) & ~jnp.asarray(sideways | on_equator)
 
     def for_lanes(self) -> tuple["RideModel", bool]:
         if not isinstance(self.input, Formula | Held) or has_arrays((self.scene, self.launch)):
