@@ -373,54 +373,14 @@ class Dynamics(eqx.Module):
     def side_force(
         self, t: Float[Array, "..."], state: State, controls: Input | None
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Side forces [N] of the ground on the rear axle and on the front wheel, to the left of each.
+        """Side forces [N] of the ground on the rear axle and on the front wheel, to the left of each; with the projected
+        heading on curved ground, they act horizontally.
 
-        From the balance of momentum across the heading and of spin about the normal (`stroller.md`, section 4), solved
-        without dividing by cos(phi).
+        From the balance of momentum and of spin about the normal (`stroller.md`, section 4): the front force times
+        -sin(phi) nu is the missing momentum along d, and the front force times cos(phi) l the missing spin; together, both
+        give the force without dividing by cos(phi). The rear force follows from the sideways momentum.
         """
-        if self.projected and not isinstance(self.surface, Plane):
-            return self._projected_side_force(t, state, controls)
-        body = self.body
-
-        def speeds(state):
-            motion = self.geometry(state).motion
-            return motion.speed, motion.yaw_rate
-
-        rate = self.field(t, state, controls)
-        (v, yaw), (v_rate, yaw_acceleration) = jax.jvp(speeds, (state,), (rate,))
-        g = self.geometry(state)
-        forces = self.forces(t, g, controls)
-        weight, up = body.mass * self.gravity, self.up
-        climb, bank = multiply(weight, dot(g.direction, up)), multiply(weight, dot(g.left, up))
-        centre_along = subtract(v_rate, multiply(body.centre, yaw, yaw))
-        centre_across = add(multiply(v, yaw), multiply(body.centre, yaw_acceleration))
-        rear_force = add(body.mass * centre_along, climb, subtract(None, add(forces.drive, forces.drag.rear)))
-        spin = add(
-            body.inertia * yaw_acceleration,
-            multiply(body.mass, body.centre, v, yaw),
-            multiply(body.centre, bank),
-            multiply(self.absolute, forces.fork),
-            subtract(None, forces.drag.yaw),
-        )
-        front = g.cosine * spin / body.wheelbase - g.sine * rear_force
-        # Curvature turns the frame as it moves, and the spin of the frame reacts with a sideways force.
-        carried = add(body.inertia * yaw, multiply(self.absolute, body.steering_inertia, g.fork_rate))
-        gyration = multiply(self.surface.gaussian_curvature(g.motion.position), carried, v)
-        lateral_force = subtract(
-            add(body.mass * centre_across, bank), add(gyration, multiply(forces.drag.front, g.sine))
-        )
-        return lateral_force - front * g.cosine, front
-
-    def _projected_side_force(
-        self, t: Float[Array, "..."], state: State, controls: Input | None
-    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Side forces [N] like `side_force`, for the projected heading on curved ground: they act horizontally.
-
-        The front force times -sin(phi) nu is the missing momentum along d, and the front force times cos(phi) l the
-        missing spin; together, both give the force without dividing by cos(phi). The rear force follows from the
-        sideways momentum.
-        """
-        body = self.body
+        body, is_horizontal = self.body, self.projected and not isinstance(self.surface, Plane)
 
         def moving(state):
             g = self.geometry(state)
@@ -429,20 +389,31 @@ class Dynamics(eqx.Module):
         _, (acceleration, yaw_acceleration) = jax.jvp(moving, (state,), (self.field(t, state, controls),))
         g = self.geometry(state)
         forces = self.forces(t, g, controls)
-        drag, heading, arm = forces.drag, g.motion.heading, body.wheelbase
-        left = cross(self.surface.up, heading)
+        drag, heading, v, yaw = forces.drag, g.motion.heading, g.motion.speed, g.motion.yaw_rate
+        left = cross(self.up, heading) if is_horizontal else g.left
         wheel_direction = sum_vectors(scale(g.cosine, heading), scale(g.sine, left))
         push = sum_vectors(scale(add(forces.drive, drag.rear), heading), scale(drag.front, wheel_direction))
-        proper_acceleration = sum_vectors(acceleration, scale(self.gravity, self.surface.up))
+        # The centre of mass swings with the yaw if it is ahead of the axle.
+        swing = scale(body.centre, sum_vectors(scale(yaw_acceleration, left), scale(-yaw * yaw, heading)))
+        proper_acceleration = sum_vectors(acceleration, swing, scale(self.gravity, self.up))
         missing_force = sum_vectors(scale(body.mass, proper_acceleration), scale(-1.0, push))
-        moment = add(drag.yaw, multiply(drag.front, arm, g.sine))
-        spin = add(body.inertia * yaw_acceleration, multiply(self.absolute, forces.fork))
-        swept = g.sine * g.lead
-        weighted = subtract(g.cosine / arm * subtract(spin, moment), swept * dot(missing_force, g.direction))
-        front = weighted / (g.cosine**2 + swept**2)
+        spin = add(
+            body.inertia * yaw_acceleration,
+            multiply(body.mass, body.centre, add(v * yaw, multiply(self.gravity, dot(left, self.up)))),
+            multiply(self.absolute, forces.fork),
+        )
+        if not is_horizontal:
+            # Curvature turns the frame as it moves, and the spin of the frame reacts with a sideways force.
+            carried = add(body.inertia * yaw, multiply(self.absolute, body.steering_inertia, g.fork_rate))
+            gyration = multiply(self.surface.gaussian_curvature(g.motion.position), carried, v)
+            missing_force = sum_vectors(missing_force, scale(subtract(None, gyration), left))
+        moment = add(drag.yaw, multiply(drag.front, body.wheelbase, g.sine))
+        swept = multiply(g.sine, g.lead)
+        momentum = multiply(swept, dot(missing_force, g.direction))
+        front = subtract(g.cosine / body.wheelbase * subtract(spin, moment), momentum) / (g.cosine**2 + swept**2)
         square = dot(g.direction, g.direction)
-        tilt = multiply(dot(heading, g.normal), dot(left, g.normal))
-        return dot(missing_force, g.left) / square - front * (g.cosine + g.sine * tilt / square), front
+        tilt = multiply(g.sine, dot(heading, g.normal), dot(left, g.normal), 1.0 / square)
+        return dot(missing_force, g.left) / square - front * add(g.cosine, tilt), front
 
 
 def padded(components: State | list[Array]) -> Vector:
