@@ -209,18 +209,15 @@ class RideModel(AbstractSceneModel):
         return jnp.where(lost, int(Status.EVENT), status)
 
     def at_end(self, outcome: Outcome | HybridOutcome, start: Float[Array, "components cells"]) -> dict[str, Array]:
-        scene, surface = self.scene, self.scene.surface
-        size = len(jax.eval_shape(lambda: scene.state(self.launch, self.input is not None)))
-        states = scene.dynamics.righted(outcome.state[:size])
-        motion = scene.dynamics.geometry(states).motion
-        energy = scene.energy(states)
-        position = surface.in_fixed_frame(motion.position)
-        return dict(zip("xyz", position, strict=True)) | {
-            "heading": scene.dynamics.angle(motion.position, motion.heading),
-            "end_steering": motion.steering,
-            "end_speed": motion.speed,
+        scene, size = self.scene, len(jax.eval_shape(lambda: self.scene.state(self.launch, self.input is not None)))
+        end = RideState(scene, self.input, outcome.end_time, outcome.state[:size])
+        energy = scene.energy(end.states)
+        return dict(zip("xyz", end.position, strict=True)) | {
+            "heading": scene.dynamics.angle(*end.motion[:2]),
+            "end_steering": end.motion.steering,
+            "end_speed": end.motion.speed,
             "energy": energy,
-            "residual": energy - scene.energy(start[:size]) - scene.work(states),
+            "residual": energy - scene.energy(start[:size]) - scene.work(end.states),
         }
 
 
