@@ -507,8 +507,8 @@ class Problem(eqx.Module):
     @property
     def clearance(self) -> float:
         """The clearance [m] to keep at first, which the start and the goal leave."""
-        at_ends = map(np.min, self.gaps_at_ends.values() if self.obstacles else ())
-        return min(RESERVE * float(self.footprint.length), *(0.5 * float(gap) for gap in at_ends))
+        gaps = self.gaps_at_ends.values() if self.obstacles else ()
+        return min([RESERVE * float(self.footprint.length), *(0.5 * float(np.min(gap)) for gap in gaps)])
 
 
 def checked_problem(

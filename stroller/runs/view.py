@@ -95,21 +95,26 @@ def ground_of(rides: list[Trajectory], normal: np.ndarray) -> views.Arena:
     return views.arena(scene.surface, points, normal, 3.0 * length, length)
 
 
-def drawn(
-    xp: ModuleType, scene: Scene, values: dict[str, Values], angles: Sequence[Values] | Values
-) -> tuple[Values, list[tuple[Values, Values]], list[Values], list[tuple[Values, Values]]]:
-    """What is drawn of a vehicle: the ground's normal towards it; the place and the rotation of each of `PARTS`; the points of
-    `TRACES`; and start and vector of each of `FORCES`.
-
-    **Arguments:** `xp`: NumPy for a picture, or `jax.numpy` for a page; `values`: the quantities of a ride (*times, ...);
-    `angles` [rad] by which left, right and front wheel have rolled.
-    """
-    surface, length, position = scene.surface, scene.body.wheelbase, values["position"]
-    zero = xp.zeros(position.shape[:-1])
+def normals(xp: ModuleType, scene: Scene, position: Values) -> Values:
+    """Unit normals of the ground at positions (*times, 3), towards the stroller. **Arguments:** `xp`: NumPy for a picture, or
+    `jax.numpy` for a page."""
+    surface, zero = scene.surface, xp.zeros(position.shape[:-1])
     components = surface.normal(surface.in_own_axes(tuple(position.T)))
     filled = tuple(zero if part is None else xp.asarray(part) + zero for part in components)
     outward = xp.stack([xp.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
-    normal = surface.sign(scene.side, DRIVES) * outward
+    return surface.sign(scene.side, DRIVES) * outward
+
+
+def drawn(
+    xp: ModuleType, length: Array | float, normal: Values, values: dict[str, Values], angles: Sequence[Values] | Values
+) -> tuple[list[tuple[Values, Values]], list[Values], list[tuple[Values, Values]]]:
+    """What is drawn of a vehicle: the place and the rotation of each of `PARTS`; the points of `TRACES`; and start and vector
+    of each of `FORCES`.
+
+    **Arguments:** `xp`: as for `normals`; `length`: the wheelbase [m]; `normal`: that of the ground; `values`: the quantities
+    of a ride (*times, ...); `angles` [rad] by which left, right and front wheel have rolled.
+    """
+    position = values["position"]
     x = values["direction"] / xp.linalg.norm(values["direction"], axis=-1, keepdims=True)
     y = xp.cross(normal, x)
     y = y / xp.linalg.norm(y, axis=-1, keepdims=True)
@@ -128,7 +133,7 @@ def drawn(
     forces = [(contact, values["load"][..., k, None] * z) for k, contact in enumerate(contacts)]
     lefts = zip(contacts, (y, left), strict=True)
     forces += [(contact, values["side_force"][..., k, None] * axis) for k, (contact, axis) in enumerate(lefts)]
-    return normal, bodies, contacts, forces
+    return bodies, contacts, forces
 
 
 def show(run: Trajectory, number: int, name: str) -> views.Show:
@@ -141,8 +146,8 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
     times, reader = refined(run, radius)
     speeds = (np.asarray(run.speed) - yaw, np.asarray(run.speed) + yaw, np.asarray(run.front_speed))
     angles = [reader(cumulative_trapezoid(speed / radius, np.asarray(run.t), initial=0.0)) for speed in speeds]
-    values = {name: reader(run[name]) for name in SHOWN}
-    normal, bodies, points, forces = drawn(np, scene, values, angles)
+    values, normal = {name: reader(run[name]) for name in SHOWN}, reader(normals(np, scene, np.asarray(run.position)))
+    bodies, points, forces = drawn(np, length, normal, values, angles)
     wheel_mesh = views.wheel(radius, WIDTH * length, (views.DARK, views.PALE))
     meshes = (vehicle(length, colour), wheel_mesh, wheel_mesh, wheel_mesh)
     scale, width = WEIGHT * length / float(scene.body.mass * scene.gravity), 0.035 * length
@@ -340,7 +345,8 @@ def frame(scene: Scene, controls: Input | None, time: Array, rows: Float[Array, 
     the wheels."""
     state = RideState(scene, controls, time, rows[:-3])
     values = {name: QUANTITIES[name].of(name, state)[0] for name in SHOWN}
-    normal, bodies, points, forces = drawn(jnp, scene, values, rows[-3:, 0])
+    normal = normals(jnp, scene, values["position"])
+    bodies, points, forces = drawn(jnp, scene.body.wheelbase, normal, values, rows[-3:, 0])
     fastest = jnp.maximum(jnp.abs(values["speed"]), jnp.abs(values["front_speed"]))
     return Frame(
         normal=normal,
