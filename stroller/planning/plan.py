@@ -185,6 +185,9 @@ FINER = 10
 #: errors, and a limit may be the very value at its start or goal.
 ALLOWED = 1e-3
 
+#: The same for the duration, which single precision rounds.
+ROUND_OFF = 1e-6
+
 
 def checked_drive(problem: Problem, drive: Drive, tolerance: float) -> Plan:
     """The drive as a plan: its run, what this run achieves, and what stands in the way."""
@@ -218,9 +221,8 @@ def checked_drive(problem: Problem, drive: Drive, tolerance: float) -> Plan:
         last = np.asarray(run.t)[np.isfinite(run.speed)].max(initial=0.0)
         ended = f"the run ends with the status {run.status!r}, after {last:.4g} s of {float(run.t[-1]):.4g} s"
         wrong = [(1.0, ended), *(pair for pair in wrong if not np.isnan(pair[0]))]
-    # In single precision, the duration of a drive is rounded.
-    longest = float(np.asarray(problem.t1, drive.duration.dtype))
-    wrong.append((t1 / longest - 1.0, f"the drive takes {t1:.4g} s, longer than t1 = {problem.t1:.4g} s"))
+    longer = t1 / problem.t1 - 1.0 - ROUND_OFF
+    wrong.append((longer, f"the drive takes {t1:.4g} s, longer than t1 = {problem.t1:.4g} s"))
     hindrances = tuple(words for excess, words in wrong if not excess <= 0.0)
     excess = float(np.nan_to_num(sum(max(excess, 0.0) for excess, _ in wrong), nan=np.inf))
     squares = force**2 + (torque / float(problem.scene.body.wheelbase)) ** 2

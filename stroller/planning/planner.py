@@ -19,7 +19,7 @@ from nonholonomic.validation import require, require_flag, require_kind, require
 
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import Scene
-from .problem import FAR, Pose, checked_problem, frame_of
+from .problem import FAR, SQUARE, Pose, checked_problem, frame_of
 from .transcription import ORDER, Numbers, Task, drive_from, motion_at, point_residuals, windows
 
 # A network that proposes drives, step by step: it sees the goal and the obstacles from where the stroller is.
@@ -116,9 +116,8 @@ class Planner(eqx.Module):
         lengths = [jnp.arcsinh(length) for length in (ahead, aside, 4.0 * ahead, 4.0 * aside)]
         turned = [task.has_heading * dot(goal_heading, heading), task.has_heading * dot(goal_heading, left)]
         # Of the obstacles: their corners, a disc as a square. Those that pad the list are far away.
-        square = jnp.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
-        corners = [obstacles.boxes, obstacles.centres[:, None] + square * obstacles.radii[:, None, None]]
-        corners = jnp.concatenate(corners)
+        squares = obstacles.centres[:, None] + SQUARE * obstacles.radii[:, None, None]
+        corners = jnp.concatenate([obstacles.boxes, squares])
         origin, *directions = (jnp.stack(part[:2]) for part in (place, heading, left))
         seen = jnp.arcsinh((corners - origin) @ jnp.stack(directions, axis=1) / task.length)
         each = jax.vmap(self.of_obstacle)(seen.reshape(-1, CORNERS).astype(jnp.float32))

@@ -37,6 +37,9 @@ Points: TypeAlias = Float[Array | np.ndarray, "... points 2"]
 #: The numbers of boxes and of discs are padded to a multiple of this, so that other problems use the same programs.
 PADDING = 8
 
+#: The corners of a square about the origin, counterclockwise.
+SQUARE = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
+
 #: Distance [m] of the obstacles that pad a list.
 FAR = 1e9
 
@@ -91,7 +94,7 @@ class Box(Obstacle):
     def corners(self) -> Float[np.ndarray, "4 2"]:
         """The corners [m], counterclockwise."""
         cosine, sine = np.cos(float(self.angle)), np.sin(float(self.angle))
-        own = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]]) * np.array(self.size, dtype=float) / 2.0
+        own = SQUARE * np.array(self.size, dtype=float) / 2.0
         return np.array(self.centre, dtype=float) + own @ np.array([[cosine, sine], [-sine, cosine]])
 
     def distance(self, polygon: Float[np.ndarray, "*n 4 2"]) -> Float[np.ndarray, "*n"]:
