@@ -1,6 +1,7 @@
 """A network that proposes drives, and its training."""
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -159,7 +160,7 @@ class Planner(eqx.Module):
     @eqx.filter_jit
     def proposals(self, task: Task, t1: Numbers) -> tuple[Float[Array, " proposals"], Proposal]:
         """The merits of all proposals for a problem, and the proposals."""
-        return jax.vmap(self.propose, (None, None, 0))(task, t1, jnp.arange(PROPOSALS))
+        return jax.vmap(functools.partial(self.propose, task, t1))(jnp.arange(PROPOSALS))
 
 
 def merit(task: Task, proposal: Proposal, t1: Numbers) -> Numbers:

@@ -51,16 +51,12 @@ class RideState:
         # Vectors in the fixed frame, and the numbers of the place.
         self.position, self.direction = (surface.in_fixed_frame(vector) for vector in self.motion[:2])
         self.place = surface.place_at(self.motion.position)
+        self.load = self.vector((self.geometry.rear_load, self.geometry.front_load))
 
     @functools.cached_property
     def power(self) -> Power:
         forces = self.scene.dynamics.forces(self.t, self.geometry, self.controls)
         return Power(*(self.number(part) for part in forces.power))
-
-    @functools.cached_property
-    def load(self) -> Float[Array, "... 2"]:
-        front_load = self.number(self.geometry.front_load)
-        return self.vector((self.number(self.geometry.normal_force) - front_load, front_load))
 
     @functools.cached_property
     def side_force(self) -> Float[Array, "... 2"]:
