@@ -319,7 +319,7 @@ def test_the_search_finds_the_shortest_path_on_the_empty_plane():
         limits = stroller.Limits(steering=np.arctan(wheelbase) / (1.0 - LIMIT_RESERVE), speed=(slowest, 1.0))
         launch, goal = stroller.Launch((0.0, 0.0), 0.0, 0.0), stroller.Goal((x, y), heading)
         search = Search(checked_problem(scene, launch, goal, 99.0, limits=limits), 1.0, prices)
-        assert_close(search.sharpest, 1.0)
+        assert_close(search.sharpest, 1.0, rtol=1e-12)
         path, _, _ = search.run()
         assert 1.0 - 1e-9 < path.length.sum() / shortest(*path.poses[-1]) < 1.1
         assert np.hypot(*(path.poses[-1] - [x, y, heading])[:2]) < search.cell
