@@ -23,9 +23,9 @@ from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, likely, readable_unit, require_unit, shown
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure
-from ..views.explore import Answer, Frame, HybridSimulator, LiveRun, Simulator, Slider, Summary, live_page
+from ..views.explore import Answer, Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
 from ..views.stage import curves_in
-from .model import AbstractModel, Sliders, model_of, run_of
+from .model import AbstractModel, Names, Sliders, model_of, run_of
 
 # A page with sliders that simulates any model in the browser.
 
@@ -193,7 +193,7 @@ def live_run(
     drawn: AbstractModel,
     sliders: tuple[Slider, ...],
     t1: float,
-    outcome: Callable[[Any, Any, Any], tuple[Array, Array]],
+    outcome: Callable[[Any, Any], tuple[Array, Array]],
     frame: Callable[[Any, Any, Any, Any], Frame],
     *,
     title: str,
@@ -207,8 +207,7 @@ def live_run(
     **Arguments:**
 
     - `model`, `drawn`: the model that answers, with its event, and that of the drawn run, for the same `sliders`.
-    - `outcome`: function that returns the `Status` and the result of a run, or infinity; its arguments are the model, its
-      problem and the `LaneState` at the end of a smooth run, or the model, `None` and a `HybridOutcome`.
+    - `outcome`: function of the model and a `HybridOutcome` that returns the `Status` and the result of a run, or infinity.
     - `frame`: function that returns a frame; its arguments are the drawn model, the time, the rows of the state, and the
       index of the mode, `None` for a smooth run.
     - `answer`: label and unit of the result; the others as for `LiveRun` and `Answer`.
@@ -219,25 +218,25 @@ def live_run(
     def at(model: Any, values: Float[Array, " numbers"]) -> Any:
         return model.replaced({slider.path: value for slider, value in zip(sliders, values, strict=True)})
 
-    if model.smooth:
-        shown_motion = motion or (lambda drawn: drawn.problem(1, None))
-        outcomes: Any = {"outcome": lambda values, problem, lane: outcome(at(model, values), problem, lane)}
-        frames = {"frame": lambda values, problem, lane: frame(at(drawn, values), lane.time, lane.state, None)}
-        ends_late = model.continues and model.has_event
-        answering: Any = Simulator(lambda values: at(model, values).problem(1, ()), t1, settings, outcomes, ends_late)
-        moving: Any = Simulator(lambda values: shown_motion(at(drawn, values)), t1, settings, frames)
-    else:
-        options = (t1, settings, len(model.counters))
-        outcomes = {"outcome": lambda values, runs: outcome(at(model, values), None, runs)}
-        answering = HybridSimulator(
-            lambda values: at(model, values).modes(1, settings.tolerance, (), False), *options, outcomes
-        )
-        moving = HybridSimulator(
-            lambda values: at(drawn, values).modes(1, settings.tolerance, None, False),
-            *options,
-            {},
-            lambda values, mode, rows, time: frame(at(drawn, values), time, rows, mode),
-        )
+    def start(model: Any, names: Names, motion: Callable[[Any], AbstractProblem] | None = None) -> Any:
+        if not model.smooth:
+            return model.modes(1, settings.tolerance, names, False)
+        problem = model.problem(1, names) if motion is None else motion(model)
+        return (OnlyMode(problem),), jnp.zeros(1, int), problem.start()[0]
+
+    options = (t1, settings, len(model.counters))
+    answering = Simulator(
+        lambda values: start(at(model, values), ()),
+        *options,
+        model.smooth and model.continues and model.has_event,
+        outcome=lambda values, ended: outcome(at(model, values), ended),
+    )
+    moving = Simulator(
+        lambda values: start(at(drawn, values), None, motion),
+        *options,
+        False,
+        frame=lambda values, mode, rows, time: frame(at(drawn, values), time, rows, None if model.smooth else mode),
+    )
     result = Answer(*answer, answering, words or {})
     return LiveRun(title, sliders, lambda values: jnp.all(at(model, values).legal()), result, moving, summaries)
 

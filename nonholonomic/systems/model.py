@@ -385,10 +385,9 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
     centre, scale = frame_of(np.concatenate([plane_points(run) for run in runs]))
     (stage,) = portraits(runs[:1], False, (centre, scale))
 
-    def outcome(model: OwnModel, problem: Any, ended: Any) -> tuple[Array, Array]:
+    def outcome(model: OwnModel, ended: HybridOutcome) -> tuple[Array, Array]:
         if model.has_event:
-            time = ended.crossing_time if problem is None else ended.time
-            result = jnp.where(ended.status == CROSSED, time, jnp.inf)
+            result = jnp.where(ended.status == CROSSED, ended.crossing_time, jnp.inf)
         else:
             failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
             result = jnp.where(failed, jnp.inf, model.components_of(ended.state[:, 0])[0])

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic import views
+from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractPassive, ExtendedProblem
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import numbers
@@ -331,11 +332,12 @@ class WheelAngles(AbstractPassive):
         return jnp.concatenate([problem.field(time, state), speeds / (RADIUS * length)])
 
 
-def outcome(model: RideModel, problem: RideProblem, lane: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
+def outcome(model: RideModel, ended: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
     """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
-    first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
+    problem: Any = model.problem(1, ())
+    first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(ended.state)[0]
     squares = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
-    status = model.ended(lane._replace(crossing_time=lane.first_crossing), TOLERANCE)[0]
+    status = model.ended(ended, TOLERANCE)[0]
     status = jnp.where(status == int(Status.EVENT), int(Status.CONTACT_LOST), status)
     return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
 

@@ -84,10 +84,10 @@ def answers(browser, page_run, values: np.ndarray) -> np.ndarray:
     """Status, time of the event, end and final angle of runs in the browser; `values`: of the sliders, (runs, sliders)."""
     browser.get("about:blank")
     script = f"""{programs(page_run)}
-        const asks = integrator(live.answer), at = live.answer.lane, text = (x) => Number.isFinite(x) ? x : String(x);
+        const asks = integrator(live.answer), at = live.answer.runs, text = (x) => Number.isFinite(x) ? x : String(x);
         return {json.dumps(values.tolist())}.map((values) => {{
-          const lane = asks.run(values), cosine = lane[at.state + 4];
-          return [...asks.read("outcome", values), lane[at.time], Math.acos(Math.max(-1, Math.min(1, cosine)))].map(text);
+          const run = asks.run(values), cosine = run[at.state + 4];
+          return [...asks.read("outcome", values), run[at.end_time], Math.acos(Math.max(-1, Math.min(1, cosine)))].map(text);
         }})"""
     return np.array(browser.execute_script(script), dtype=float).T
 

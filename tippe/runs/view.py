@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic import views
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import AbstractProblem, Settings, crossing_time
+from nonholonomic.integration import Settings
 from nonholonomic.integration.problem import CROSSED, REACHED_END, Status
 from nonholonomic.parameters import numbers, numbers_of, with_numbers
 from nonholonomic.runs.event import Ensemble
@@ -357,17 +357,12 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     return ranges
 
 
-def outcome(model: TopModel, problem: AbstractProblem | None, ended: Any) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The `Status` of a run that ends with the inversion, and its inversion time [s], or infinity. **Arguments:** as for
-    the function `outcome` of `live_run`."""
-    time = ended.crossing_time
-    if problem is not None:
-        # A run that starts above the angle is inverted at once.
-        time = jnp.where(ended.time > 0.0, crossing_time(problem, ended.time, ended.state), 0.0)
+def outcome(model: TopModel, ended: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The `Status` of a run that ends with the inversion, and its inversion time [s], or infinity."""
     status = model.ended(ended, TOLERANCE)[0]
     for code, word in ((Status.EVENT, Status.INVERTED), (Status.COMPLETED, Status.NOT_INVERTED)):
         status = jnp.where(status == int(code), int(word), status)
-    return status, jnp.where(ended.status[0] == CROSSED, time[0], jnp.inf)
+    return status, jnp.where(ended.status[0] == CROSSED, ended.crossing_time[0], jnp.inf)
 
 
 def stage_at_start(model: TopModel, t1: float) -> views.Stage:

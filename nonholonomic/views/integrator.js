@@ -1,4 +1,4 @@
-// The loops over steps and stages, rounds and flights. Everything else is generated from Python (`live.py`) and is
+// The loops over steps and stages, rounds and flights. Everything else is generated from Python (`explore.py`) and is
 // in `model`: the equations, the coefficients of the Runge-Kutta pair, the first step, step-size control, the location of
 // events, and what happens between the modes.
 "use strict";
@@ -84,80 +84,57 @@ function integrator(model) {
     return { run, within, constants, lane };
   }
 
-  // Read a run at increasing times, from its pieces in order; each piece has the `time` at which it begins.
-  function reader(pieces, read) {
-    return (times) => {
+  // Each round integrates one mode to its end, and its transition leads to the next mode.
+  const kinds = model.kinds.map((kind) => ({ ...kind, motion: stepper(kind) })), at = model.runs, runs = new Float64Array(at.size);
+
+  function run(values, record) {
+    model.first(values, runs);
+    for (let round = 0; round < model.rounds && runs[at.status] === model.running; round++) {
+      const kind = kinds[model.modes[runs[at.mode]]], { motion } = kind, before = record && runs.slice(), began = runs[at.end_time];
+      motion.run([values, runs], record && ((one) => record({
+        time: began + one.time,
+        mode: before[at.mode],
+        rows: (wanted) => kind.shown(values, before, motion.within(one, wanted - began), []),
+      })));
+      kind.ended(motion.constants, motion.lane, values, runs, runs);
+      if (runs[at.status] === model.left) leave(kind, values, record);
+    }
+    if (runs[at.status] === model.running) runs[at.status] = model.unresolved;
+    return runs;
+  }
+
+  // The transition at the end of a mode: instantaneous, or through flights that end with impacts.
+  function leave(kind, values, record) {
+    if (kind.reset) { kind.reset(values, runs, runs); return; }
+    const before = runs.slice(), began = runs[at.end_time];
+    let [open, elapsed, ...stretch] = kind.lost(values, before, []);
+    for (let hops = 0; open && hops < kind.most_hops; hops++) {
+      const from = stretch, start = elapsed;
+      [open, elapsed, ...stretch] = kind.hop(values, before, from, []);
+      if (record && elapsed > start) {
+        record({ time: began + start, mode: -1, rows: (wanted) => kind.between(values, before, from, [wanted - began - start], []) });
+      }
+    }
+    kind.closed(values, before, stretch, runs);
+  }
+
+  // A run with its pieces in order, each with the `time` at which it begins, which is read at increasing times.
+  function trajectory(values, reading) {
+    const pieces = [];
+    run(values, (piece) => pieces.push(piece));
+    if (!pieces.length) {
+      const kind = kinds[model.modes[runs[at.mode]]], state = runs.slice(at.state, at.state + kind.components);
+      pieces.push({ time: 0, mode: runs[at.mode], rows: () => kind.shown(values, runs, state, []) });
+    }
+    const read = (times) => {
       let k = 0;
       return Array.from(times, (wanted) => {
         while (k + 1 < pieces.length && pieces[k + 1].time <= wanted) k++;
-        return Float64Array.from(read(pieces[k], wanted));
+        return Float64Array.from(model[reading](values, [pieces[k].mode], pieces[k].rows(wanted), [wanted], []));
       });
     };
+    return { end: runs[at.end_time], steps: pieces.length, read };
   }
 
-  function smooth() {
-    const motion = stepper(model), { constants, lane } = motion, at = model.lane;
-    const run = (values, record) => (motion.run([values], record), lane);
-    // A run with all its steps.
-    function trajectory(values, reading) {
-      const steps = [];
-      run(values, (one) => steps.push(one));
-      const ended = lane[at.time], copy = lane.slice();
-      const read = reader(steps, (one, wanted) => {
-        if (one) {
-          copy.set(motion.within(one, wanted), at.state);
-          copy[at.time] = wanted;
-        }
-        return model[reading](values, constants, copy, []);
-      });
-      return { end: ended, steps: steps.length, read };
-    }
-    return { run, trajectory, read: (name, values) => model[name](values, constants, lane, []) };
-  }
-
-  // Runs through several modes: each round integrates one mode to its end, and its transition leads to the next mode.
-  function hybrid() {
-    const kinds = model.kinds.map((kind) => ({ ...kind, motion: stepper(kind) })), at = model.runs, runs = new Float64Array(at.size);
-
-    function run(values, record) {
-      model.first(values, runs);
-      for (let round = 0; round < model.rounds && runs[at.status] === model.running; round++) {
-        const kind = kinds[model.modes[runs[at.mode]]], { motion } = kind, before = record && runs.slice(), began = runs[at.end_time];
-        motion.run([values, runs], record && ((one) => record({
-          time: began + one.time,
-          mode: before[at.mode],
-          rows: (wanted) => kind.shown(values, before, motion.within(one, wanted - began), []),
-        })));
-        kind.ended(motion.constants, motion.lane, runs, runs);
-        if (runs[at.status] === model.left) leave(kind, values, record);
-      }
-      if (runs[at.status] === model.running) runs[at.status] = model.unresolved;
-      return runs;
-    }
-
-    // The transition at the end of a mode: instantaneous, or through flights that end with impacts.
-    function leave(kind, values, record) {
-      if (kind.reset) { kind.reset(values, runs, runs); return; }
-      const before = runs.slice(), began = runs[at.end_time];
-      let [open, elapsed, ...stretch] = kind.lost(values, before, []);
-      for (let hops = 0; open && hops < kind.most_hops; hops++) {
-        const from = stretch, start = elapsed;
-        [open, elapsed, ...stretch] = kind.hop(values, before, from, []);
-        if (record && elapsed > start) {
-          record({ time: began + start, mode: -1, rows: (wanted) => kind.between(values, before, from, [wanted - began - start], []) });
-        }
-      }
-      kind.closed(values, before, stretch, runs);
-    }
-
-    function trajectory(values, reading) {
-      const pieces = [];
-      run(values, (piece) => pieces.push(piece));
-      const read = reader(pieces, (piece, wanted) => model[reading](values, [piece.mode], piece.rows(wanted), [wanted], []));
-      return { end: runs[at.end_time], steps: pieces.length, read };
-    }
-    return { run, trajectory, read: (name, values) => model[name](values, runs, []) };
-  }
-
-  return model.kinds ? hybrid() : smooth();
+  return { run, trajectory, read: (name, values) => model[name](values, runs, []) };
 }

@@ -1,7 +1,7 @@
 // Sliders that simulate again while they move: the result as text, the run for the player, the map, and the page's address.
 "use strict";
 (async () => {
-  const { facts, answer, motion, allowed } = window.live, { sliders, words, layout } = facts;
+  const { facts, answer, motion, allowed } = window.live, { sliders, words } = facts, { layout } = motion;
   const [asks, moves] = [integrator(answer), integrator(motion)];
   const box = document.getElementById("explore"), result = document.getElementById("result");
   const element = (kind, parent, properties = {}) => parent.appendChild(Object.assign(document.createElement(kind), properties));
