@@ -287,7 +287,7 @@ def arena(
     **Returns:** an `Arena`.
     """
     points = points[np.all(np.isfinite(points), axis=-1)]
-    chart = _Patch(surface, points) if len(surface.coordinates) == 3 else _Chart(surface, points)
+    chart = _Chart(surface, points)
     sides, marks, words = [], [], []
     for number, (place, is_angle, length) in enumerate(zip(chart.places, chart.angles, chart.lengths, strict=True)):
         low, high = place.min() - margin / length, place.max() + margin / length
@@ -318,20 +318,22 @@ def _charted(surface: AbstractSurface, place: tuple) -> tuple:
     return surface.chart(place)[0]
 
 
-@eqx.filter_jit
-def _nearest(surface: AbstractSurface, position: tuple) -> tuple:
-    return surface.nearest(position)
-
-
 class _Chart:
-    """A surface whose places are two numbers, lengths or angles.
+    """Two numbers, lengths or angles, for the places of a surface. If these are positions, the numbers are lengths in a tangent
+    plane, whose nearest points of the surface are the places.
 
     - `places`: both numbers at the given points; `angles`: whether a number is an angle; `lengths`: the least length [m]
       along the surface per unit of a number, at these places.
     """
 
     def __init__(self, surface: AbstractSurface, points: Float[np.ndarray, "points 3"]):
-        self.surface = surface
+        self.surface, self.is_patch = surface, len(surface.coordinates) == 3
+        if self.is_patch:
+            self.middle = fixed(surface, _charted(surface, own(surface, points.mean(axis=0))))
+            self.axes = np.stack([fixed(surface, axis) for axis in surface.chart(tuple(own(surface, self.middle)))[1:]])
+            self.places = list(((points - self.middle) @ self.axes.T).T)
+            self.angles, self.lengths = [False, False], [1.0, 1.0]
+            return
         self.angles = [unit == "rad" for _, unit in surface.coordinates]
         places = [np.asarray(number, dtype=float) for number in surface.place_at(own(surface, points.T))]
         self.places = [np.unwrap(place) if angle else place for place, angle in zip(places, self.angles, strict=True)]
@@ -342,10 +344,16 @@ class _Chart:
 
     def grid(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """The points [m] at two numbers, in the fixed frame."""
-        return fixed(self.surface, _charted(self.surface, (first, second)))
+        place = first, second
+        if self.is_patch:
+            flat = self.middle + first[..., None] * self.axes[0] + second[..., None] * self.axes[1]
+            place = own(self.surface, np.moveaxis(flat, -1, 0))
+        return fixed(self.surface, _charted(self.surface, place))
 
     def legal(self, number: int, low: float, high: float) -> tuple[float, float]:
         """The part of a range in which a number is legal: a latitude ends at the poles."""
+        if self.is_patch:
+            return low, high
         candidates = np.linspace(low, high, 401)
         place = [np.full_like(candidates, np.median(values)) for values in self.places]
         place[number] = candidates
@@ -355,26 +363,6 @@ class _Chart:
             difference = (difference + np.pi) % (2.0 * np.pi) - np.pi
         legal = candidates[np.abs(difference) < 1e-6 * (1.0 + np.abs(candidates))]
         return (low, high) if len(legal) < 2 else (legal[0], legal[-1])
-
-
-class _Patch:
-    """A surface whose places are positions: the nearest points to a part of its tangent plane, whose two lengths stand for
-    the numbers of a `_Chart`."""
-
-    def __init__(self, surface: AbstractSurface, points: Float[np.ndarray, "points 3"]):
-        self.surface = surface
-        self.middle = fixed(surface, _nearest(surface, own(surface, points.mean(axis=0))))
-        _, east, north = surface.chart(tuple(own(surface, self.middle)))
-        self.axes = np.stack([fixed(surface, east), fixed(surface, north)])
-        self.places = list(((points - self.middle) @ self.axes.T).T)
-        self.angles, self.lengths = [False, False], [1.0, 1.0]
-
-    def grid(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        flat = self.middle + first[..., None] * self.axes[0] + second[..., None] * self.axes[1]
-        return fixed(self.surface, _nearest(self.surface, own(self.surface, np.moveaxis(flat, -1, 0))))
-
-    def legal(self, number: int, low: float, high: float) -> tuple[float, float]:
-        return low, high
 
 
 def own(surface: AbstractSurface, position: np.ndarray) -> tuple:
