@@ -24,12 +24,13 @@ from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, 
 from nonholonomic.sweeps import Table
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import require_folder
+from nonholonomic.views.explore import Frame
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .model.body import Top
 from .model.scene import Launch, Scene
 from .runs.verbs import inversion_table, simulate
-from .runs.view import DrawnMotion, Panel, draw_launches, stages
+from .runs.view import Panel, draw_launches, frames, stages
 
 #: The paper's units in SI.
 GRAM, CENTIMETRE = 1e-3, 1e-2
@@ -241,12 +242,12 @@ def described(options: argparse.Namespace) -> list[str]:
 
 
 @compiled_quickly
-def moving(scene: Scene[Top], launches: Launch, times: np.ndarray, tolerance: Any) -> DrawnMotion:
+def moving(scene: Scene[Top], launches: Launch, times: np.ndarray, tolerance: Any) -> Frame:
     """The drawn quantities of every launch at the given times, in one batched run."""
-    return jax.vmap(lambda launch: DrawnMotion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
+    return jax.vmap(lambda launch: frames(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
 
-def drawn(options: argparse.Namespace, t1: float) -> tuple[np.ndarray, dict[str, DrawnMotion]]:
+def drawn(options: argparse.Namespace, t1: float) -> tuple[np.ndarray, dict[str, Frame]]:
     """The times of the plot, up to `t1` [s], and the drawn quantities of every launch in each arena.
 
     All numbers are arrays: another Python number would compile a new program, so the picture and the page could not
@@ -272,7 +273,7 @@ def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
     panels, thetas = [], np.asarray(options.theta)
     for arena, scene in scenes(options).items():
         etas, _ = starts(options, scene)
-        angles = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
+        angles = np.asarray(runs[arena].curves[0]).reshape(len(etas), len(thetas), -1)
         ends = by_arena[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
             name = shown_name(options, arena)
@@ -290,10 +291,10 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[vie
     tilt = np.where(ends + 0.5 <= step, options.theta, np.inf)
     row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
     last = min(options.t1, step, float(ends[row]) + 0.5)
-    (_, runs), groups = drawn(options, last), []
+    (times, runs), groups = drawn(options, last), []
     for arena, scene in scenes(options).items():
         name = f"{shown_name(options, arena)}, θ(0) = {options.theta[row]:.4g} rad"
-        groups.append([(name, scene, DrawnMotion(*(np.asarray(part)[row] for part in runs[arena])))])
+        groups.append([(name, scene, times, jax.tree.map(lambda part: np.asarray(part)[row], runs[arena]))])
     return stages(groups)
 
 

@@ -9,7 +9,7 @@ import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -347,11 +347,12 @@ def _strings(numbers: Sequence[Number]) -> list[str]:
 
 # The contents of a page at one time of a run, in the form for the player (`player.js`).
 
-Three = Float[Array, "3"]
+#: JAX's arrays for a page, or NumPy's for a picture.
+Kind = TypeVar("Kind", Array, np.ndarray)
 
 
-class Frame(NamedTuple):
-    """One moment of a run, with bodies, traces, arrows and curves in the order of the `Show` of the page.
+class Frame(NamedTuple, Generic[Kind]):
+    """One moment of a run, or several, with bodies, traces, arrows and curves in the order of the `Show` of the page.
 
     - `normal`: normal of the arena, towards the body; `bodies`: position [m] and quaternion (x, y, z, w) of each body.
     - `traces`: the point of each trace [m], and the point to which it is relative, or `None`.
@@ -359,12 +360,12 @@ class Frame(NamedTuple):
     - `turning_rate`: greatest rotation rate of all parts [rad/s], which determines the number of frames.
     """
 
-    normal: Three
-    bodies: tuple[tuple[Three, Float[Array, "4"]], ...]
-    traces: tuple[tuple[Three, Three | None], ...]
-    arrows: tuple[tuple[Three, Three], ...]
-    curves: tuple[Float[Array, ""], ...]
-    turning_rate: Float[Array, ""]
+    normal: Float[Kind, "*times 3"]
+    bodies: tuple[tuple[Float[Kind, "*times 3"], Float[Kind, "*times 4"]], ...]
+    traces: tuple[tuple[Float[Kind, "*times 3"], Float[Kind, "*times 3"] | None], ...]
+    arrows: tuple[tuple[Float[Kind, "*times 3"], Float[Kind, "*times 3"]], ...]
+    curves: tuple[Float[Kind, "*times"], ...]
+    turning_rate: Float[Kind, "*times"]
 
 
 def quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:

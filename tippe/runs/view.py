@@ -4,9 +4,10 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -60,135 +61,120 @@ GREEN, VIOLET, BLUE, GOLD = 0x1F8A4C, 0x7B4FA3, 0x1B6CA8, 0xE0A100
 BLACK, TEAL, PINK = 0x23262B, 0x008C95, 0xC2378E
 
 
-#: JAX's arrays, or NumPy's for drawing.
-Numbers = TypeVar("Numbers", Array, np.ndarray)
+#: The arrows that a page does not show at first, all from the centre of mass: name, unit, length and colour.
+AT_CENTRE = (
+    ("weight at the centre of mass", "N", WEIGHT, BLACK),
+    ("angular velocity", "rad/s", SPIN, TEAL),
+    ("angular momentum", "kg m²/s", SPIN, PINK),
+)
 
 
-class DrawnMotion(NamedTuple, Generic[Numbers]):
-    """The drawn quantities of a run: vectors in the fixed frame, (times, 3), and the rotation from the body to this
-    frame."""
-
-    times: Float[Numbers, " times"]
-    position: Float[Numbers, "times 3"]
-    axis: Float[Numbers, "times 3"]
-    normal: Float[Numbers, "times 3"]
-    contact: Float[Numbers, "times 3"]
-    slip: Float[Numbers, "times 3"]
-    rotation: Float[Numbers, "times 3 3"]
-    theta: Float[Numbers, " times"]
-    energy: Float[Numbers, " times"]
-    jellett: Float[Numbers, " times"]
-    normal_force: Float[Numbers, " times"]
-    angular_velocity: Float[Numbers, "times 3"]
-    angular_momentum: Float[Numbers, "times 3"]
-
-    @staticmethod
-    def of(run: AbstractTrajectory) -> "DrawnMotion[Array]":
-        """The motion of one run, inside or outside of transformations."""
-        body, slip = run.scene.body, run.slip
-        position, axis, normal, zero = run.position, run.axis, run.normal, jnp.zeros_like(run.t)
-        contact: Array = run.contact if not isinstance(body, Top) else position - body.radius * normal
-        if isinstance(body, Top) and body.stem is not None:
+def frames(run: AbstractTrajectory) -> Frame[Array]:
+    """The drawn quantities of a run at its times, the first axis of every array, in the order of `show`; inside or outside
+    of transformations."""
+    scene, body, slip, position, axis, normal = run.scene, run.scene.body, run.slip, run.position, run.axis, run.normal
+    radius, offset, zero = body.size, 0.0, jnp.zeros_like(run.t)
+    contact: Array = run.contact
+    if isinstance(body, Top):
+        contact, offset = position - body.radius * normal, body.offset
+        if body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
-        parts = {"times": run.t, "position": position, "axis": axis, "normal": normal, "contact": contact}
-        parts |= {"slip": run._fixed((slip[:, 0], slip[:, 1], zero))}
-        return DrawnMotion(**parts, **{name: getattr(run, name) for name in DrawnMotion._fields if name not in parts})
+    # Above the ground, where lines are visible.
+    above, centre = contact + 0.02 * radius * normal, position - offset * axis
+    rotation = (run.angular_velocity * normal).sum(axis=-1) if isinstance(body, AbstractRigidBody) else run.jellett
+    return Frame(
+        normal=normal,
+        bodies=((position, jax.vmap(quaternion)(run.rotation)),),
+        traces=((above, None), (AXIS * radius * axis, position)),
+        arrows=(
+            (above, run.normal_force[:, None] * normal),
+            (above, run._fixed((slip[:, 0], slip[:, 1], zero))),
+            (centre, jnp.stack([zero, zero, zero - body.mass * scene.gravity], axis=-1)),
+            (centre, run.angular_velocity),
+            (centre, run.angular_momentum),
+        ),
+        curves=(run.theta, run.energy, rotation, run.normal_force),
+        turning_rate=jnp.linalg.norm(run.angular_velocity, axis=-1),
+    )
 
 
-_motion = eqx.filter_jit(DrawnMotion.of)
+_frames = eqx.filter_jit(frames)
 _rotation_rate = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
 
 
-def motion(run: AbstractTrajectory) -> DrawnMotion[np.ndarray]:
-    """The motion of one run. If the run can be evaluated between its times, the times are close enough to show the
-    rotation."""
+def motion(run: AbstractTrajectory) -> tuple[np.ndarray, Frame[np.ndarray]]:
+    """The times and the drawn quantities of one run. If the run can be evaluated between its times, the times are close enough
+    to show the rotation."""
     if run.dense is not None:
         times = np.asarray(run.t)
         # The angle about the axis is not enough: half-way up, a top turns about other directions equally fast.
         turned_by = np.trapezoid(np.asarray(_rotation_rate(run.padded()))[: len(times)], times)
-        frames = int(np.clip(turned_by / TURN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
-        run = run.at(np.linspace(0.0, float(run.end_time), frames))
-    count = len(run.t)
-    return DrawnMotion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
+        count = int(np.clip(turned_by / TURN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
+        run = run.at(np.linspace(0.0, float(run.end_time), count))
+    return np.asarray(run.t), jax.tree.map(lambda part: np.asarray(part)[: len(run.t)], _frames(run.padded()))
 
 
-def show(scene: Scene, motion: DrawnMotion[np.ndarray], number: int, name: str) -> views.Show:
+def show(scene: Scene, times: np.ndarray, frames: Frame[np.ndarray], number: int, name: str) -> views.Show:
     """The drawing of one run, the `number`-th of its stage."""
-    body, colour = scene.body, views.COLOURS[number % len(views.COLOURS)]
-    motion = DrawnMotion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
+    body, colour, (theta, *_) = scene.body, views.COLOURS[number % len(views.COLOURS)], frames.curves
+    times, frames = jax.tree.map(lambda part: part[np.isfinite(theta)], (times, frames))
     radius, weight = float(body.size), float(body.mass * scene.gravity)
-    arrow_start = motion.contact + 0.02 * radius * motion.normal
+    ((position, orientation),), (contact, axis), (force, slip, *others) = frames.bodies, frames.traces, frames.arrows
+    width, speed = 0.05 * radius, np.linalg.norm(slip[1], axis=-1)
+    common = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
+    arrows = [
+        views.Arrow("normal force", *force, "N", WEIGHT * radius / weight, VIOLET, width, through=True),
+        views.Arrow("slip", *slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
+    ]
+    for (arrow, unit, length, shade), (start, vector) in zip(AT_CENTRE, others, strict=True):
+        scale = length * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
+        arrows.append(views.Arrow(arrow, start, vector, unit, scale, shade, width, None, True, False))
+    rotation = OF_RIGID_BODIES["normal_spin"] if isinstance(body, AbstractRigidBody) else QUANTITIES["jellett"]
+    labels = [QUANTITIES["energy"].label, rotation.label, QUANTITIES["normal_force"].label]
     return views.Show(
         name,
         colour,
-        motion.times,
-        motion.normal,
+        times,
+        frames.normal,
         radius,
-        (views.Body("top", motion.position, views.turned(motion.rotation), meshes(body, colour)),),
+        (views.Body("top", position, orientation, meshes(body, colour)),),
         (
-            views.Trace("contact", arrow_start, GREEN, 0.06 * radius),
-            views.Trace("path of the axis", AXIS * radius * motion.axis, BLUE, 0.012 * radius, motion.position, False),
+            views.Trace("contact", contact[0], GREEN, 0.06 * radius),
+            views.Trace("path of the axis", axis[0], BLUE, 0.012 * radius, axis[1], False),
         ),
-        arrows(motion, float(body.offset) if isinstance(body, Top) else 0.0, radius, weight),
-        (
-            views.Curve("θ, normal to axis [rad]", motion.theta),
-            views.Curve(QUANTITIES["energy"].label, motion.energy),
-            views.Curve(*curve_of_rotation(scene, motion)),
-            views.Curve(QUANTITIES["normal_force"].label, motion.normal_force),
-        ),
+        tuple(arrows),
+        tuple(map(views.Curve, ["θ, normal to axis [rad]", *labels], frames.curves)),
     )
-
-
-def curve_of_rotation(scene: Scene, motion: DrawnMotion[Numbers]) -> tuple[str, Any]:
-    """Label and values of the curve of the rotation: Jellett's quantity, or, for a body of any shape and inertia, the spin
-    about the normal."""
-    if isinstance(scene.body, AbstractRigidBody):
-        return OF_RIGID_BODIES["normal_spin"].label, (motion.angular_velocity * motion.normal).sum(axis=-1)
-    return QUANTITIES["jellett"].label, motion.jellett
-
-
-def arrows(motion: DrawnMotion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[views.Arrow, ...]:
-    """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
-    arrow_start = motion.contact + 0.02 * radius * motion.normal
-    centre = motion.position - offset * motion.axis
-    speed = np.linalg.norm(motion.slip, axis=-1)
-    common = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
-    weight_vector = np.broadcast_to([0.0, 0.0, -weight], centre.shape)
-    push, width = motion.normal_force[:, None] * motion.normal, 0.05 * radius
-    arrows = [
-        views.Arrow("normal force", arrow_start, push, "N", WEIGHT * radius / weight, VIOLET, width, through=True),
-        views.Arrow("slip", arrow_start, motion.slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
-    ]
-    for name, vector, unit, length, colour in (
-        ("weight at the centre of mass", weight_vector, "N", WEIGHT, BLACK),
-        ("angular velocity", motion.angular_velocity, "rad/s", SPIN, TEAL),
-        ("angular momentum", motion.angular_momentum, "kg m²/s", SPIN, PINK),
-    ):
-        scale = length * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
-        arrows.append(views.Arrow(name, centre, vector, unit, scale, colour, width, None, True, False))
-    return tuple(arrows)
 
 
 @stages_of.register(AbstractTrajectory)
 def _(run: AbstractTrajectory, runs: list[AbstractTrajectory], overlaid: bool, unit: Unit) -> list[views.Stage]:
-    drawn = [(name, run.scene, motion(run)) for name, run in zip(names_of(runs, unit), runs, strict=True)]
+    drawn = [(name, run.scene, *motion(run)) for name, run in zip(names_of(runs, unit), runs, strict=True)]
     return stages([drawn] if overlaid else [[one] for one in drawn])
 
 
-def stages(groups: list[list[tuple[str, Scene, DrawnMotion]]]) -> list[views.Stage]:
-    """A stage for each group of runs on a common arena, with their names; all runs have different colours."""
+def stages(groups: list[list[tuple[str, Scene, np.ndarray, Frame[np.ndarray]]]]) -> list[views.Stage]:
+    """A stage for each group of runs on a common arena, with their names, times and drawn quantities; all runs have different
+    colours."""
     all_stages, number = [], 0
     for group in groups:
-        (_, scene, first), radius = group[0], float(group[0][1].body.size)
-        points = np.concatenate([motion.contact for _, _, motion in group])
-        ground = views.arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
+        _, scene, _, first = group[0]
+        ground = arena_of(scene, [frames for *_, frames in group], first.normal[0])
         shows = views.distinguished_by_colour(
-            tuple(show(of_run, motion, number + k, name) for k, (name, of_run, motion) in enumerate(group))
+            tuple(
+                show(of_run, times, frames, number + k, name) for k, (name, of_run, times, frames) in enumerate(group)
+            )
         )
-        all_stages.append(views.Stage("; ".join(name for name, _, _ in group), ground, shows))
+        all_stages.append(views.Stage("; ".join(show.name for show in shows), ground, shows))
         number += len(group)
     return all_stages
+
+
+def arena_of(scene: Scene, runs: list[Frame[np.ndarray]], normal: np.ndarray, margin: float = 0.0) -> views.Arena:
+    """The part of the arena on which runs take place. **Arguments:** `margin`: its least width [m] beyond their contacts."""
+    points, size = np.concatenate([frames.traces[0][0] for frames in runs]), float(scene.body.size)
+    return views.arena(scene.surface, points, normal, max(margin, 4.0 * size), 2.5 * size)
 
 
 def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[views.Mesh, ...]:
@@ -302,9 +288,8 @@ def _(model: TopModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, vie
         return live, stage_at_start(model, t1)
     # The first run, on a part of the arena that also contains the others.
     runs = runs_at_ends(model, live.sliders, t1)
-    (first,), surface, size = runs[0].stages(), runs[0].scene.surface, float(runs[0].scene.body.size)
-    points = np.concatenate([motion(run).contact for run in runs])
-    return live, first._replace(arena=views.arena(surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
+    (first,) = runs[0].stages()
+    return live, first._replace(arena=arena_of(runs[0].scene, [motion(run)[1] for run in runs], first.arena.normal))
 
 
 def page_of_launch(model: TopModel, sliders: Sliders | None, t1: float) -> LiveRun:
@@ -326,7 +311,7 @@ def page_of_launch(model: TopModel, sliders: Sliders | None, t1: float) -> LiveR
         knobs,
         float(t1),
         outcome,
-        lambda drawn, time, rows, mode: frame(drawn.scene, drawn.moment(rows, mode)),
+        lambda drawn, time, rows, mode: jax.tree.map(lambda part: part[0], frames(drawn.moment(rows, mode))),
         title=f"{'Rigid body' if is_rigid else 'Tippe top'} on a {type(scene.surface).__name__.lower()}",
         answer=("reversal time" if reverses else answer, "s"),
         words=REVERSED if reverses else None,
@@ -367,50 +352,24 @@ def outcome(model: TopModel, ended: HybridOutcome) -> tuple[Int[Array, ""], Floa
 
 def stage_at_start(model: TopModel, t1: float) -> views.Stage:
     """The top on a level plane at its launch; the page replaces it by a simulated run before it is visible."""
-    scene = model.scene
-    start = DrawnMotion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(model)))
-    initial_show, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
+    scene, size = model.scene, float(model.scene.body.size)
+    start = jax.tree.map(lambda part: np.repeat(np.asarray(part), 2, axis=0), _frames_at_start(model))
+    initial_show = show(scene, np.array([0.0, 1.0]), start, 0, "")
     # Slips grow as the top rises; a slip at half the speed of the equator gets the longest arrow.
     normal_force, slip, *arrows = initial_show.arrows
     assert slip.limit is not None
-    fastest = 0.5 * size * float(np.linalg.norm(start.angular_velocity[0]))
-    slip = slip._replace(scale=slip.limit / max(fastest, 1e-12))
+    slip = slip._replace(scale=slip.limit / max(0.5 * size * float(start.turning_rate[0]), 1e-12))
     initial_show = initial_show._replace(arrows=(normal_force, slip, *arrows))
-    reach = REACH * math.sqrt(float(scene.gravity) * size) * t1
-    ground = views.arena(scene.surface, start.contact, start.normal[0], max(reach, 10.0 * size), 2.5 * size)
-    return views.Stage("", ground, (initial_show,), follows=True)
+    reach = max(REACH * math.sqrt(float(scene.gravity) * size) * t1, 10.0 * size)
+    return views.Stage("", arena_of(scene, [start], start.normal[0], reach), (initial_show,), follows=True)
 
 
 @eqx.filter_jit
-def _motion_at_start(model: TopModel) -> DrawnMotion[Array]:
+def _frames_at_start(model: TopModel) -> Frame[Array]:
     modes, number, state = model.modes(1, jnp.asarray(TOLERANCE), None, False)
     # The other tops stand on their stem.
     mode = dataclasses.replace(modes[0], number=number) if isinstance(modes[0], Slide) else modes[0]
-    return DrawnMotion.of(model.moment(mode.shown(state), number))
-
-
-def frame(scene: Scene, run: AbstractTrajectory) -> Frame:
-    """The drawn quantities of a top for a run with a single time, in the order of `view.show`."""
-    motion = DrawnMotion(*(part[0] for part in DrawnMotion.of(run)))
-    radius = scene.body.size
-    arrow_start = motion.contact + 0.02 * radius * motion.normal
-    offset = scene.body.offset if isinstance(scene.body, Top) else 0.0
-    centre = motion.position - offset * motion.axis
-    weight = jnp.stack([jnp.zeros(()), jnp.zeros(()), -scene.body.mass * scene.gravity])
-    return Frame(
-        normal=motion.normal,
-        bodies=((motion.position, quaternion(motion.rotation)),),
-        traces=((arrow_start, None), (AXIS * radius * motion.axis, motion.position)),
-        arrows=(
-            (arrow_start, motion.normal_force * motion.normal),
-            (arrow_start, motion.slip),
-            (centre, weight),
-            (centre, motion.angular_velocity),
-            (centre, motion.angular_momentum),
-        ),
-        curves=(motion.theta, motion.energy, curve_of_rotation(scene, motion)[1], motion.normal_force),
-        turning_rate=jnp.linalg.norm(motion.angular_velocity),
-    )
+    return frames(model.moment(mode.shown(state), number))
 
 
 # The plot of the main job: theta(t) of every launch, as in the papers' figures 2 and 3 (needs matplotlib), and theta(t) of
