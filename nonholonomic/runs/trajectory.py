@@ -23,7 +23,7 @@ from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, likely, readable_unit, require_unit, shown
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure
-from ..views.explore import Answer, Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
+from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
 from ..views.stage import curves_in
 from .model import AbstractModel, Names, Sliders, model_of, run_of
 
@@ -210,7 +210,7 @@ def live_run(
     - `outcome`: function of the model and a `HybridOutcome` that returns the `Status` and the result of a run, or infinity.
     - `frame`: function that returns a frame; its arguments are the drawn model, the time, the rows of the state, and the
       index of the mode, `None` for a smooth run.
-    - `answer`: label and unit of the result; the others as for `LiveRun` and `Answer`.
+    - `answer`: label and unit of the result; the others as for `LiveRun`.
     - `motion`: function that returns the problem of a smooth drawn run; by default that of the model.
     """
     settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
@@ -237,8 +237,16 @@ def live_run(
         False,
         frame=lambda values, mode, rows, time: frame(at(drawn, values), time, rows, None if model.smooth else mode),
     )
-    result = Answer(*answer, answering, words or {})
-    return LiveRun(title, sliders, lambda values: jnp.all(at(model, values).legal()), result, moving, summaries)
+    return LiveRun(
+        title,
+        sliders,
+        lambda values: jnp.all(at(model, values).legal()),
+        answering,
+        *answer,
+        words or {},
+        moving,
+        summaries,
+    )
 
 
 # Pictures of a user's system: the first and the last component of its state as a point in a plane, and curves of all.

@@ -8,7 +8,6 @@ import json
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -488,7 +487,7 @@ class OnlyMode(AbstractBatchedMode):
 
     def reset_map(self, state: States, left: Lanes) -> Transition:
         zero, none = jnp.zeros_like(left), jnp.zeros(left.shape, int)
-        return Transition(none, state, zero, none + LEFT_DOMAIN, zero + jnp.inf, jnp.zeros((0, *left.shape), int))
+        return Transition(none, state, zero, none + LEFT_DOMAIN, zero + jnp.inf, none[None])
 
 
 Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]
@@ -623,16 +622,6 @@ class Slider(NamedTuple):
     value: float
 
 
-class Answer(NamedTuple):
-    """The result of a run, which the page also shows as a map: its `label` and `unit`, and the `simulator` whose
-    `outcome` it is. `words` contains the words of statuses to which the page gives another name."""
-
-    label: str
-    unit: str
-    simulator: Simulator
-    words: Mapping[int, str] = MappingProxyType({})
-
-
 class Summary(NamedTuple):
     """A curve of the `Show` whose values at the start and the end of the run are also shown as numbers."""
 
@@ -646,7 +635,9 @@ class LiveRun(NamedTuple):
 
     - `title`: title of the page.
     - `sliders`: the sliders; `allowed`: function that returns whether their numbers are legal in combination.
-    - `answer`: the result of a run.
+    - `answer`: the simulator whose `outcome` is the result of a run, which the page also shows as a map; `label`, `unit`: those
+      of the result.
+    - `words`: the words of statuses to which the page gives another name.
     - `motion`: the simulator of the drawn run, with its `frame`.
     - `summaries`: numbers shown beside the result.
     """
@@ -654,7 +645,10 @@ class LiveRun(NamedTuple):
     title: str
     sliders: tuple[Slider, ...]
     allowed: Callable[[Numbers], Bool[Array, ""]]
-    answer: Answer
+    answer: Simulator
+    label: str
+    unit: str
+    words: Mapping[int, str]
     motion: Simulator
     summaries: tuple[Summary, ...]
 
@@ -679,13 +673,13 @@ def programs(live: LiveRun) -> str:
     values = jnp.array([slider.value for slider in live.sliders])
     facts = {
         "sliders": [slider._asdict() for slider in live.sliders],
-        "words": {int(status): status.word for status in Status} | dict(live.answer.words),
-        "answer": {"label": live.answer.label, "unit": live.answer.unit},
+        "words": {int(status): status.word for status in Status} | dict(live.words),
+        "answer": {"label": live.label, "unit": live.unit},
         "summaries": [summary._asdict() for summary in live.summaries],
     }
     parts = {
         "facts": json.dumps(facts),
-        "answer": live.answer.simulator.javascript(values),
+        "answer": live.answer.javascript(values),
         "motion": live.motion.javascript(values),
         "allowed": javascript("", live.allowed, values),
     }

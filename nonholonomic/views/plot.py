@@ -1,6 +1,5 @@
 """Plots of tables, of quantities over time, of the curves of a page, and of fits (needs matplotlib)."""
 
-import functools
 import io
 import itertools
 import math
@@ -44,24 +43,19 @@ WIDTH = 90
 LEAST_RANGE = 1e-3
 
 
-@functools.cache
-def _kind_of_figure() -> type["Figure"]:
+def new_figure(width: float = 7.0, height: float = 4.5) -> "Figure":
+    """An empty matplotlib figure of a size in inches. A notebook shows it even if figures are not displayed automatically."""
     from matplotlib.figure import Figure
 
-    class Picture(Figure):
-        """A figure that a notebook shows even if figures are not displayed automatically."""
+    figure: Any = Figure(figsize=(width, height), layout="constrained")
 
-        def _repr_png_(self) -> bytes:
-            image = io.BytesIO()
-            self.savefig(image, format="png")
-            return image.getvalue()
+    def png() -> bytes:
+        image = io.BytesIO()
+        figure.savefig(image, format="png")
+        return image.getvalue()
 
-    return Picture
-
-
-def new_figure(width: float = 7.0, height: float = 4.5) -> "Figure":
-    """An empty matplotlib figure of a size in inches, which a notebook shows."""
-    return _kind_of_figure()(figsize=(width, height), layout="constrained")
+    figure._repr_png_ = png
+    return figure
 
 
 def draw_table(
