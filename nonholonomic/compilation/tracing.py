@@ -87,20 +87,10 @@ def with_own_numbers(event: Function, *args: PyTree) -> Function:
             results = jaxpr_as_fun(program)(*jax.tree.leaves(args))
             return jax.tree.unflatten(jax.tree.structure(shape), results)
 
-        return _WithConstants(list(closed.consts), TracedFunction(evaluated, program))
+        return eqx.Partial(TracedFunction(evaluated, program), list(closed.consts))
     if not all(callable(leaf) for leaf in jax.tree.leaves(event)):
         return event
     return jax.tree.map(lambda function: TracedFunction(function, closed), event)
-
-
-class _WithConstants(eqx.Module):
-    """A traced function with its constants as numbers."""
-
-    consts: list[Array]
-    function: "TracedFunction"
-
-    def __call__(self, *args: PyTree) -> PyTree:
-        return self.function(self.consts, *args)
 
 
 class TracedFunction:
@@ -405,6 +395,9 @@ GROWING = """
     stop_gradient tanh tile transpose unstack
 """
 
+#: Other operations that grow (+) or fall (-) with each operand.
+MONOTONE = {"sub": "+-", "ge": "+-", "gt": "+-", "le": "-+", "lt": "-+", "neg": "-", "not": "-", "erfc": "-"}
+
 #: Operations that call another traced function; and operations that jump, from one whole number to another.
 CALLS = ("closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "jit", "pjit")
 STEPPING = ["ceil", "convert_element_type", "floor", "round", "sign"]
@@ -461,14 +454,16 @@ def _applied(equation: Equation, boxes: list[Bounds], leaps: list[Array], loose:
         return program
     if name == "scan":
         return _repeated(equation, boxes, leaps, loose)
-    if name in GROWING.split():
-        lows, highs = map(functools.partial(bound, equation), zip(*boxes, strict=True) if boxes else ([], []))
+    if name in COMPARISONS and same:
+        # Asks whether this is a number.
+        results = [_exactly(jnp.full(boxes[0].low.shape, name in ("eq", "ge", "le")))]
+    elif name in GROWING.split() or name in MONOTONE:
+        signs = MONOTONE.get(name, "+" * len(boxes))
+        ends = [box if sign == "+" else box[::-1] for sign, box in zip(signs, boxes, strict=True)]
+        lows, highs = map(functools.partial(bound, equation), zip(*ends, strict=True) if ends else ([], []))
         results = list(map(Bounds, lows, highs))
     elif name == "mul" and same:
         results = [_even(boxes[0], jnp.square)]
-    elif name in COMPARISONS and same:
-        # Asks whether this is a number.
-        results = [_exactly(jnp.full(boxes[0].low.shape, name in ("eq", "ge", "le")))]
     elif name in RULES and not (name in ("div", "rem") and jnp.issubdtype(boxes[0].low.dtype, jnp.integer)):
         results = [RULES[name](*boxes)]
     elif name in RULES_WITH_PARAMETERS and (name != "sort" or len(boxes) == 1):
@@ -625,8 +620,9 @@ def _equal(a: Bounds, b: Bounds) -> Bounds:
     return Bounds((a.low == b.high) & (a.high == b.low), (a.low <= b.high) & (a.high >= b.low))
 
 
-def _opposite(box: Bounds) -> Bounds:
-    return Bounds(~box.high, ~box.low)
+def _different(a: Bounds, b: Bounds) -> Bounds:
+    equal = _equal(a, b)
+    return Bounds(~equal.high, ~equal.low)
 
 
 RULES: dict[str, Callable[..., Bounds]] = {
@@ -638,17 +634,10 @@ RULES: dict[str, Callable[..., Bounds]] = {
     "cosh": lambda box: _even(box, jnp.cosh),
     "div": _quotient,
     "eq": _equal,
-    "ge": lambda a, b: Bounds(a.low >= b.high, a.high >= b.low),
-    "gt": lambda a, b: Bounds(a.low > b.high, a.high > b.low),
-    "le": lambda a, b: Bounds(a.high <= b.low, a.low <= b.high),
-    "lt": lambda a, b: Bounds(a.high < b.low, a.low < b.high),
     "mul": _product,
-    "ne": lambda a, b: _opposite(_equal(a, b)),
-    "erfc": lambda box: Bounds(jax.lax.erfc(box.high), jax.lax.erfc(box.low)),
+    "ne": _different,
     "is_finite": lambda box: Bounds(jnp.isfinite(box.low) & jnp.isfinite(box.high), jnp.ones(box.low.shape, bool)),
-    "neg": lambda box: Bounds(-box.high, -box.low),
-    "not": _opposite,
-    "one_minus_square": lambda box: RULES["sub"](_exactly(1.0), _even(box, jnp.square)),
+    "one_minus_square": lambda box: Bounds(*(1.0 - end for end in reversed(_even(box, jnp.square)))),
     "polynomial": _polynomial,
     "pow": _power,
     "rem": _remainder,
@@ -657,7 +646,6 @@ RULES: dict[str, Callable[..., Bounds]] = {
     "sin": lambda box: _cosine(Bounds(box.low - 0.5 * jnp.pi, box.high - 0.5 * jnp.pi)),
     "sqrt": lambda box: Bounds(*(jnp.sqrt(jnp.maximum(end, 0.0)) for end in box)),
     "square": lambda box: _even(box, jnp.square),
-    "sub": lambda a, b: Bounds(a.low - b.high, a.high - b.low),
     "tan": _tangent,
 }
 
