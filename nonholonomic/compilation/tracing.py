@@ -13,6 +13,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..validation import UNTRACEABLE, is_traced, warn
+from .components import BY_ELEMENT
 from .xla_cpu import (
     Equation,
     Function,
@@ -28,13 +29,10 @@ from .xla_cpu import (
 
 #: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with other operations,
 #: such as LAPACK calls, scatters and sorts, is not compiled into a single kernel.
-ELEMENTARY = """
-    abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e broadcast_in_dim cbrt ceil clamp
-    concatenate convert_element_type copy copy_p cos cosh custom_jvp_call custom_vjp_call digamma div eq erf erf_inv erfc exp
-    exp2 expand_dims expm1 floor full ge gt integer_pow iota is_finite jit le lgamma log log1p log2 logistic lt max min mul ne
-    neg nextafter not one_minus_square optimization_barrier or pad pjit polynomial pow reduce_and reduce_max reduce_min
-    reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt select_and_n select_n sign sin sinh slice split sqrt square
-    squeeze stack stop_gradient sub tan tanh tile transpose unstack xor zeros_like
+ELEMENTARY = f"""{BY_ELEMENT}
+    bessel_i0e bessel_i1e broadcast_in_dim concatenate custom_jvp_call custom_vjp_call expand_dims full iota jit
+    optimization_barrier pad pjit reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum reshape rev select_and_n
+    slice split squeeze stack tile transpose unstack zeros_like
 """
 
 
