@@ -19,7 +19,8 @@ import numpy as np
 from jax.tree_util import DictKey
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .text import AbstractHeld, Numbers, gathered, likely, name_of, spread
+from .compilation.components import Held
+from .text import Numbers, gathered, likely, name_of, spread
 
 #: The values of a parameter along an axis of a grid.
 Axis = TypeVar("Axis")
@@ -37,7 +38,7 @@ def numbers(root: str, tree: PyTree, functions: bool = True) -> dict[str, Any]:
     **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for an optional number
     that was omitted.
     """
-    values, tree = {}, tree.function if isinstance(tree, AbstractHeld) else tree
+    values, tree = {}, tree.function if isinstance(tree, Held) else tree
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
         if parts := _parts(name, value):
@@ -196,7 +197,7 @@ def _unknown_axis(name: str, known: list[str]) -> ValueError:
 
 
 def _replaced(name: str, tree: PyTree, values: Mapping[str, Any]) -> PyTree:
-    if isinstance(tree, AbstractHeld):
+    if isinstance(tree, Held):
         return type(tree)(_replaced(name, tree.function, values))
     changes = {}
     for field in dataclasses.fields(tree):
@@ -217,7 +218,7 @@ def description(root: str, tree: PyTree) -> dict[str, Any]:
 
     A function is described by its name alone. Nothing in the data is different in another process.
     """
-    tree = tree.function if isinstance(tree, AbstractHeld) else tree
+    tree = tree.function if isinstance(tree, Held) else tree
     fields: dict[str, Any] = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)

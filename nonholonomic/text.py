@@ -7,7 +7,7 @@ import inspect
 import math
 import operator
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -81,25 +81,6 @@ def is_array(leaf: object) -> bool:
 def is_users(kind: type) -> bool:
     """Whether a class is a user's, not one of these packages."""
     return kind.__module__.partition(".")[0] not in OWN
-
-
-class AbstractHeld(eqx.Module):
-    """A user's module that is a function, with `Numbers` in place of its arrays. This object has its attributes, too."""
-
-    function: eqx.AbstractVar[Callable[..., Any]]
-
-    @property
-    def whole(self) -> PyTree:
-        """The module with its arrays."""
-        return joined(self.function)
-
-    def __repr__(self) -> str:
-        return repr(self.whole)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or name == "function":
-            raise AttributeError(name)
-        return getattr(self.whole, name)
 
 
 # Values of parameters as text, with units, and hints for messages.

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from ..text import AbstractHeld, is_array, is_numbers, is_users, joined, parted
+from ..text import is_array, is_numbers, is_users, joined, parted
 from ..validation import is_traced
 from .xla_cpu import Equation, Function, Program, bound, read_program, stored, traced
 
@@ -527,10 +527,11 @@ def held(value: Any, evaluate: Function) -> Any:
     return parted(value) if all(result.shape == () for result in jax.tree.leaves(results)) else value
 
 
-class Held(AbstractHeld):
+class Held(eqx.Module):
     """A user's module that is a function of numbers, written for a single run, as a function of numbers or of lanes.
 
-    `function` is the module with `Numbers` in place of its arrays: each number is a leaf.
+    This object has the module's attributes, too. `function` is the module with `Numbers` in place of its arrays: each number
+    is a leaf.
     """
 
     function: Function
@@ -538,3 +539,16 @@ class Held(AbstractHeld):
     @method_over_lanes
     def __call__(self, *arguments: PyTree) -> PyTree:
         return self.function(*arguments)
+
+    @property
+    def whole(self) -> PyTree:
+        """The module with its arrays."""
+        return joined(self.function)
+
+    def __repr__(self) -> str:
+        return repr(self.whole)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "function":
+            raise AttributeError(name)
+        return getattr(self.whole, name)

@@ -17,10 +17,10 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Float
 
-from nonholonomic.compilation.components import TooLarge, by_components, over_last_axis, spelled_out
+from nonholonomic.compilation.components import Held, TooLarge, by_components, over_last_axis, spelled_out
 from nonholonomic.compilation.tracing import TracedFunction, in_cells, is_elementary, jumps_of, warn_of_unclear
 from nonholonomic.geometry import Vector
-from nonholonomic.text import AbstractHeld, is_users, name_of, shown
+from nonholonomic.text import is_users, name_of, shown
 from nonholonomic.validation import Bounded, as_number, is_traced
 
 
@@ -152,7 +152,7 @@ def is_searched(controls: Any) -> bool:
     if is_users(type(controls)):
         return True
     # A module that evaluates another one ride by ride.
-    if isinstance(controls, AbstractHeld):
+    if isinstance(controls, Held):
         return is_searched(controls.function)
     inner = getattr(controls, "input", getattr(controls, "function", None))
     return getattr(controls, "searched", False) if inner is None else is_searched(inner)
