@@ -207,7 +207,7 @@ MEMBERS = {
     "jackknifed_at",
     "stroller.Motion": "position heading steering speed front_speed yaw_rate steering_rate",
     "tippe.Status": "word of",
-    "tippe.Table": "shape dims long_names load save to_xarray to_dataframe plot digits",
+    "tippe.Table": "shape dims load save to_xarray to_dataframe plot digits",
     "tippe.LyapunovExponent": "exponent error status end_time steps times running",
     "tippe.InversionTimes": "measurements",
     "tippe.ReversalTimes": "measurements",

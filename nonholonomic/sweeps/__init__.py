@@ -25,8 +25,8 @@ from .grid import axis as axis
 from .grid import cells_to_check as cells_to_check
 from .grid import scattered_cells as scattered_cells
 from .grid import size_of as size_of
-from .processes import local_processes as local_processes
 from .running import chunk_for as chunk_for
+from .running import local_processes as local_processes
 from .running import sweep as sweep
 from .table import Quantity as Quantity
 from .table import Table as Table

@@ -17,6 +17,7 @@ import platform
 import re
 import shutil
 import zlib
+from collections import UserDict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
@@ -30,19 +31,13 @@ import numpy as np
 
 from ..integration.problem import FORMER_WORDS
 from ..validation import as_path, real_path, replacing, sync_folder, warn
-from .grid import EQUATIONS, LONG_NAMES, PENDING, Layout, Values, boxes
+from .grid import EQUATIONS, PENDING, Layout, Values, axes_of, boxes
 
 if TYPE_CHECKING:
     import h5py
 
 #: The group of the checksums.
 CHECKSUMS = "checksums"
-
-#: The attribute of a variable with its long name, as in CF.
-LONG_NAME = "long_name"
-
-#: The file's attribute that names the dimensions of variables other than those of the grid.
-INNER = "inner"
 
 #: Variables of tables larger than this [bytes] are read only when needed.
 MAX_BYTES_IN_MEMORY = 1 << 27
@@ -138,11 +133,7 @@ class Stream(io.FileIO):
 
 def _describe(file: "h5py.File", layout: Layout) -> None:
     """Write everything in a table except the numbers of its variables."""
-    attributes: dict[str, Any] = (
-        layout.attributes | ({INNER: layout.inner} if layout.inner else {}) | {"Conventions": "CF-1.10"}
-    )
-    long_names = json.loads(attributes.pop(LONG_NAMES, "{}"))
-    for name, value in attributes.items():
+    for name, value in (layout.attributes | {"Conventions": "CF-1.10"}).items():
         _set(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
     meanings = dict(layout.words)
     for name, values in layout.coords.items():
@@ -151,7 +142,7 @@ def _describe(file: "h5py.File", layout: Layout) -> None:
         file.create_dataset(name, data=values).make_scale(name)
     for name, kind in layout.kinds.items():
         array = file.create_dataset(name, shape=layout.shape + layout.inner_shape(name), dtype=kind)
-        for axis, coordinate in enumerate((*layout.axes, *layout.inner.get(name, ()))):
+        for axis, coordinate in enumerate((*axes_of(layout.coords, layout.inner), *layout.inner.get(name, ()))):
             array.dims[axis].attach_scale(file[coordinate])
     for name in (*layout.coords, *layout.kinds):
         if name in meanings:
@@ -159,8 +150,8 @@ def _describe(file: "h5py.File", layout: Layout) -> None:
             _set(file[name], "flag_meanings", " ".join(meanings[name]))
         else:
             _set(file[name], "units", layout.units.get(name, "1"))
-        if name in long_names:
-            _set(file[name], LONG_NAME, long_names[name])
+        if name in layout.long_names:
+            _set(file[name], "long_name", layout.long_names[name])
 
 
 def _set(node: "h5py.HLObject", name: str, value: object) -> None:
@@ -195,7 +186,7 @@ def _attribute(node: "h5py.HLObject", name: str, is_text: bool = False) -> Any:
     return value
 
 
-class Stored(Mapping[str, Values]):
+class Stored(UserDict[str, Any]):
     """The variables of a table that stays in its file: each is read, and checked against its checksums, when needed.
 
     `path`: the file; `layout`: its contents.
@@ -213,20 +204,13 @@ class Stored(Mapping[str, Values]):
         self.path = path
         with self._opened() as file:
             self.layout, self._sums = _contents(file)
+        # The names alone; `__getitem__` reads the numbers.
+        self.data = dict.fromkeys(self.layout.kinds)
 
     def __getitem__(self, name: str) -> Values:
-        if name not in self.layout.kinds:
+        if name not in self:
             raise KeyError(name)
         return self.layout.shaped(name, self.whole(name))
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.layout.kinds
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.layout.kinds)
-
-    def __len__(self) -> int:
-        return len(self.layout.kinds)
 
     def whole(self, name: str) -> Values:
         """A variable of all cells, which are along the first axis.
@@ -276,21 +260,19 @@ class Stored(Mapping[str, Values]):
 
 def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     """A file's layout, and its checksums by variable."""
-    coords, kinds, units, words, shapes, long_names = {}, {}, {}, {}, {}, {}
+    coords, kinds, units, words, inner, shapes, long_names = {}, {}, {}, {}, {}, {}, {}
     if "request" not in file.attrs:
         raise ValueError("it names no request")
-    attributes = {name: _attribute(file, name) for name in file.attrs if name not in ("Conventions", LONG_NAMES)}
+    attributes = {name: _attribute(file, name) for name in file.attrs if name != "Conventions"}
     for name in ("request", "versions"):
         if not isinstance(json.loads(attributes.get(name, "{}")), dict):
             raise ValueError(f"the attribute {name} is not a dictionary")
-    inner = {name: tuple(dims) for name, dims in json.loads(attributes.pop(INNER, "{}")).items()}
-    dims = [*json.loads(attributes["axes"]), *(dim for dims in inner.values() for dim in dims)]
-    checksums = cast("h5py.Group", file[CHECKSUMS])
+    axes, checksums = json.loads(attributes["axes"]), cast("h5py.Group", file[CHECKSUMS])
     sums = {name: _values(checksums, name) for name in map(str, checksums)}
-    for name in (*dict.fromkeys(dims), *(name for name in map(str, file) if name not in (*dims, CHECKSUMS))):
+    for name in (*axes, *(name for name in map(str, file) if name not in (*axes, CHECKSUMS))):
         array = cast("h5py.Dataset", file[name])
-        if LONG_NAME in array.attrs:
-            long_names[name] = _attribute(array, LONG_NAME, is_text=True)
+        if "long_name" in array.attrs:
+            long_names[name] = _attribute(array, "long_name", is_text=True)
         if "flag_meanings" in array.attrs:
             meanings = _attribute(array, "flag_meanings", is_text=True).split()
             # Words of earlier versions are converted to current ones.
@@ -299,7 +281,7 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
             )
         else:
             units[name] = _attribute(array, "units", is_text=True)
-        if name in dims:
+        if array.is_scale:
             coords[name] = _values(file, name)
             if coords[name].ndim != 1:
                 raise ValueError(f"{name} is not a list of numbers")
@@ -307,10 +289,10 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
                 raise ValueError(f"{name} does not match its checksum")
         else:
             kinds[name], shapes[name] = array.dtype, array.shape
-    if long_names:
-        attributes[LONG_NAMES] = json.dumps(long_names, sort_keys=True)
+            if dims := list(array.dims)[len(axes) :]:
+                inner[name] = tuple(str(dim[0].name).removeprefix("/") for dim in dims)
     coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
-    layout = Layout(coords, kinds, units, attributes, words, inner, int(_attribute(checksums, "block")))
+    layout = Layout(coords, kinds, units, attributes, words, inner, int(_attribute(checksums, "block")), long_names)
     if layout.chunk < 1:
         raise ValueError(f"its chunks have {layout.chunk} cells")
     for name, shape in shapes.items():
@@ -437,17 +419,17 @@ class ChunkStore:
         bytes_needed = 2 * self.layout.bytes_of_cells(self.layout.cells)
         try:
             room = shutil.disk_usage(self.folder).free
-            if room < bytes_needed:
-                raise OSError(
-                    0,
-                    f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * bytes_needed:.3g} GB while it is computed",
-                )
             sync_folder(self.folder.parent)
         except OSError as error:
             raise OSError(f"cannot write {self.path}: {error.strerror}") from None
+        if room < bytes_needed:
+            sizes = (
+                f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * bytes_needed:.3g} GB while it is computed"
+            )
+            raise OSError(f"cannot write {self.path}: {sizes}")
         write_file(header, self.layout, ())
 
-    def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
+    def fill(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> None:
         """Store each chunk when it is computed, and write the table's file from these and from the existing chunks.
 
         Chunks that are written to the file during the computation need not be read again at the end.
@@ -459,7 +441,6 @@ class ChunkStore:
         for chunk in chunks_in(self.folder, self.layout):
             (self.folder / f"{chunk}.npz").unlink(missing_ok=True)
         (self.folder / HEADER).unlink(missing_ok=True)
-        return Stored(self.path)
 
     def _all(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Iterator[tuple[int, dict[str, Values]]]:
         for chunk, values in computed:
@@ -556,29 +537,31 @@ def saved_cells(path: Path) -> int:
     return sum(map(layout.size, chunks_in(folder, layout)))
 
 
-def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
-    """The finished part of an unfinished table; `None` if there is none.
+def contents_of(path: Path) -> tuple[Layout, Mapping[str, Values]]:
+    """The layout of a table, and its variables with all cells along the first axis, or the `Stored` variables of a large
+    table. Of an unfinished table, these are the chunks that are on disk.
 
-    **Returns:** its layout, and its variables with all cells along the first axis.
-
-    **Raises:** `OSError` that names the path if a chunk is damaged.
+    **Raises:** `OSError` that names the path if it cannot be read, holds no table, or has a damaged chunk.
     """
     folder = folder_of(path)
-    if path.exists() or not (folder / HEADER).exists():
-        return None
-    layout = Stored(folder / HEADER).layout
-    variables, damaged = layout.empty(layout.cells), 0
-    for chunk in chunks_in(folder, layout):
-        values = read_chunk(folder, layout, chunk)
-        damaged += values is None
-        layout.put(variables, chunk, values or {})
-    if path.exists():
-        # The table was finished in the meantime.
-        return None
-    if damaged:
-        reason = f"{damaged} of its {layout.chunks} chunks do not match their checksums"
-        raise OSError(f"cannot read {path}: it is damaged: {reason}")
-    return layout, variables
+    if not path.exists() and (folder / HEADER).exists():
+        layout = Stored(folder / HEADER).layout
+        variables, damaged = layout.empty(layout.cells), 0
+        for chunk in chunks_in(folder, layout):
+            values = read_chunk(folder, layout, chunk)
+            damaged += values is None
+            layout.put(variables, chunk, values or {})
+        # The table may have been finished in the meantime.
+        if not path.exists():
+            if damaged:
+                reason = f"{damaged} of its {layout.chunks} chunks do not match their checksums"
+                raise OSError(f"cannot read {path}: it is damaged: {reason}")
+            return layout, variables
+    stored = Stored(path)
+    layout = stored.layout
+    if layout.bytes_of_cells(layout.cells) > MAX_BYTES_IN_MEMORY:
+        return layout, stored
+    return layout, {name: stored.whole(name) for name in layout.kinds}
 
 
 def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | None:

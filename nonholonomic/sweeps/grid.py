@@ -4,20 +4,15 @@ import functools
 import itertools
 import json
 import math
-import os
-import pickle
 import platform
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Shaped
 
 from .. import __version__
-from ..compilation.cache import forget_programs_if_many
 from ..validation import require
 
 # The layout of a table: everything except its numbers, and the division of its cells into chunks.
@@ -28,9 +23,6 @@ if TYPE_CHECKING:
 else:
     #: A variable of a table: an array or, for words of a table of one cell, a NumPy string.
     Tabulated = Values | np.str_
-
-#: The attribute of a table with the long names of its variables; in a file, each variable has its own.
-LONG_NAMES = "long_names"
 
 #: The name of the checksum of a user's equations in a request.
 EQUATIONS = "equations"
@@ -53,16 +45,12 @@ class Layout(NamedTuple):
     words: dict[str, tuple[str, ...]]
     inner: dict[str, tuple[str, ...]]
     chunk: int
-
-    @property
-    def axes(self) -> list[str]:
-        """The coordinates that are axes of the grid."""
-        return axes_of(self.coords, self.inner)
+    long_names: dict[str, str]
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the grid."""
-        return tuple(len(self.coords[name]) for name in self.axes)
+        return tuple(len(self.coords[name]) for name in axes_of(self.coords, self.inner))
 
     @property
     def cells(self) -> int:
@@ -115,10 +103,9 @@ class Layout(NamedTuple):
         return cells * sum(kind.itemsize * math.prod(self.inner_shape(name)) for name, kind in self.kinds.items())
 
 
-def attributes_of(request: str, axes: list[str], long_names: dict[str, str]) -> dict[str, str]:
-    """The attributes of a table: what was computed, in JSON, over which axes, with which versions, and the long names."""
-    attributes = {"request": request, "axes": json.dumps(axes), "versions": json.dumps(versions())}
-    return attributes | ({LONG_NAMES: json.dumps(long_names, sort_keys=True)} if long_names else {})
+def attributes_of(request: dict[str, object], axes: list[str]) -> dict[str, str]:
+    """The attributes of a table: what was computed, in JSON, over which axes, and with which versions."""
+    return {"request": json.dumps(request, default=repr), "axes": json.dumps(axes), "versions": json.dumps(versions())}
 
 
 def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:
@@ -282,73 +269,6 @@ def scattered_cells(axes: list[Axis]) -> dict[str, Values]:
     return {axis.number: axis.values for axis in axes}
 
 
-# The computation of several cells of a grid, in this process or in another process that has only the data that it
-# received.
-
-#: A function from (full name of a parameter -> values of some cells, number of cells to compute) to (name -> results).
-Job = Callable[[dict[str, Values], int], dict[str, Values]]
-
-#: Packages and settings that must agree wherever a part of a table is computed.
-MUST_AGREE = ("nonholonomic", "jax", "jaxlib", "diffrax", "float")
-
-
-class ChunkTask(NamedTuple):
-    """A job and its grid; `chunk`: number of cells in each call of the job, always the same, so that it is compiled
-    once."""
-
-    job: Job
-    axes: list[Axis]
-    chunk: int
-
-    def compile(self) -> None:
-        """Call the job with padding alone, to compile it."""
-        self.job(columns(self.axes, 0, self.chunk), 0)
-
-    def results(self, first: int, count: int) -> dict[str, Values]:
-        """The results of `count` cells, starting with cell `first`."""
-        end = min(first + count, size_of(self.axes))
-        parts = []
-        for start in range(first, end, self.chunk):
-            count_of_part = min(self.chunk, end - start)
-            variables = self.job(columns(self.axes, start, self.chunk), count_of_part)
-            parts.append({name: np.asarray(values)[:count_of_part] for name, values in variables.items()})
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def remote_results(payload: bytes, needed: dict[str, str], first: int, count: int, mark: str) -> dict[str, Values]:
-    """Compute the results of several cells in a worker process.
-
-    **Arguments:** `payload`: a pickled `ChunkTask`; `needed`: the `stamp` of the sender; `first`, `count`: as for
-    `ChunkTask.results`; `mark`: different in every call, because Dask merges calls with equal arguments.
-
-    **Raises:** `RuntimeError` that names the worker if a package there has another version, which may give other
-    results.
-    """
-    local = stamp()
-    for name in MUST_AGREE:
-        if local[name] != needed[name]:
-            raise RuntimeError(
-                f"the worker {platform.node()}, process {os.getpid()}, has {name} {local[name]}, and {needed[name]} is needed: "
-                "all workers of a table need the same versions"
-            )
-    # Otherwise, threads of one worker would compile the same program twice.
-    with _unpacking:
-        work = _unpacked(payload)
-    return work.results(first, count)
-
-
-_unpacking = threading.Lock()
-
-
-@functools.lru_cache(maxsize=4)
-def _unpacked(payload: bytes) -> ChunkTask:
-    """The work, compiled once per process, however many parts of it arrive."""
-    forget_programs_if_many()
-    work = pickle.loads(payload)
-    work.compile()
-    return work
-
-
 @functools.cache
 def versions() -> dict[str, str]:
     """The versions that a result depends on."""
@@ -356,9 +276,3 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), "nonholonomic": __version__} | {
         name: version(name) for name in packages
     }
-
-
-def stamp() -> dict[str, str]:
-    """The versions and the precision of numbers in this process."""
-    # Float64 may have been switched off by hand.
-    return versions() | {"float": str(np.dtype(jnp.result_type(float)))}

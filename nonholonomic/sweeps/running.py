@@ -1,11 +1,12 @@
-"""Compute a grid in chunks, store each chunk when it finishes, and return a table."""
+"""Compute a grid in chunks, store each chunk when it finishes, and return a table; processes that compute the chunks."""
 
 import contextlib
 import functools
 import itertools
-import json
+import multiprocessing
 import os
 import pickle
+import platform
 import signal
 import sys
 import threading
@@ -13,8 +14,9 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from queue import SimpleQueue
-from typing import Any, cast
+from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +25,83 @@ import numpy as np
 from ..compilation.cache import forget_programs_if_many, memory_of_machine
 from ..terminal import Progress
 from ..text import shown
-from ..validation import require_flag, warn
+from ..validation import require, require_flag, warn
 from ._store import ChunkStore, with_spaces
-from .grid import Axis, ChunkTask, Job, Layout, Values, Variable, attributes_of, columns, remote_results, size_of, stamp
+from .grid import Axis, Layout, Values, Variable, attributes_of, columns, size_of, versions
 from .table import Table
+
+# The computation of several cells of a grid, in this process or in another process that has only the data that it
+# received.
+
+#: A function from (full name of a parameter -> values of some cells, number of cells to compute) to (name -> results).
+Job = Callable[[dict[str, Values], int], dict[str, Values]]
+
+#: Packages and settings that must agree wherever a part of a table is computed.
+MUST_AGREE = ("nonholonomic", "jax", "jaxlib", "diffrax", "float")
+
+
+class ChunkTask(NamedTuple):
+    """A job and its grid; `chunk`: number of cells in each call of the job, always the same, so that it is compiled
+    once."""
+
+    job: Job
+    axes: list[Axis]
+    chunk: int
+
+    def compile(self) -> None:
+        """Call the job with padding alone, to compile it."""
+        self.job(columns(self.axes, 0, self.chunk), 0)
+
+    def results(self, first: int, count: int) -> dict[str, Values]:
+        """The results of `count` cells, starting with cell `first`."""
+        end = min(first + count, size_of(self.axes))
+        parts = []
+        for start in range(first, end, self.chunk):
+            count_of_part = min(self.chunk, end - start)
+            variables = self.job(columns(self.axes, start, self.chunk), count_of_part)
+            parts.append({name: np.asarray(values)[:count_of_part] for name, values in variables.items()})
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def remote_results(payload: bytes, needed: dict[str, str], first: int, count: int, mark: str) -> dict[str, Values]:
+    """Compute the results of several cells in a worker process.
+
+    **Arguments:** `payload`: a pickled `ChunkTask`; `needed`: the `stamp` of the sender; `first`, `count`: as for
+    `ChunkTask.results`; `mark`: different in every call, because Dask merges calls with equal arguments.
+
+    **Raises:** `RuntimeError` that names the worker if a package there has another version, which may give other
+    results.
+    """
+    local = stamp()
+    for name in MUST_AGREE:
+        if local[name] != needed[name]:
+            raise RuntimeError(
+                f"the worker {platform.node()}, process {os.getpid()}, has {name} {local[name]}, and {needed[name]} is needed: "
+                "all workers of a table need the same versions"
+            )
+    # Otherwise, threads of one worker would compile the same program twice.
+    with _unpacking:
+        work = _unpacked(payload)
+    return work.results(first, count)
+
+
+_unpacking = threading.Lock()
+
+
+@functools.lru_cache(maxsize=4)
+def _unpacked(payload: bytes) -> ChunkTask:
+    """The work, compiled once per process, however many parts of it arrive."""
+    forget_programs_if_many()
+    work = pickle.loads(payload)
+    work.compile()
+    return work
+
+
+def stamp() -> dict[str, str]:
+    """The versions and the precision of numbers in this process."""
+    # Float64 may have been switched off by hand.
+    return versions() | {"float": str(np.dtype(jnp.result_type(float)))}
+
 
 # Dispatch chunks to an executor as its workers become free, and dispatch a chunk again if its worker died.
 
@@ -189,7 +264,8 @@ def sweep(
             # Ctrl-C may arrive while a chunk is saved. The traceback would then keep `chunks` alive, and its workers busy.
             with contextlib.closing(chunks):
                 if store is not None:
-                    return Table.of(store.filled(chunks))
+                    store.fill(chunks)
+                    return Table.load(store.path)
                 of_all_cells = layout.empty(layout.cells)
                 for number, values in chunks:
                     layout.put(of_all_cells, number, values)
@@ -255,14 +331,12 @@ def layout_of(
     words = {name: variable.words for name, variable in variables.items() if variable.words is not None}
     without_unit = {*words, *(name for name, values in coords.items() if values.dtype.kind == "U")}
     units = {name: part.unit for name, part in described.items() if name not in without_unit}
-    attributes = attributes_of(
-        json.dumps(request | {"float": str(np.dtype(jnp.result_type(float)))}),
-        [axis.name for axis in axes],
-        {name: part.long_name for name, part in described.items() if part.long_name},
-    )
+    request = request | {"float": str(np.dtype(jnp.result_type(float)))}
+    attributes = attributes_of(request, [axis.name for axis in axes])
+    long_names = {name: part.long_name for name, part in described.items() if part.long_name}
     kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
     dims = {name: variable.inner for name, variable in variables.items() if variable.inner}
-    return Layout(coords, kinds, units, attributes, words, dims, chunk)
+    return Layout(coords, kinds, units, attributes, words, dims, chunk, long_names)
 
 
 @contextlib.contextmanager
@@ -376,3 +450,158 @@ def no_interrupt_lost() -> Iterator[Callable[[], None]]:
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = hook
+
+
+# Processes on this machine, each with its own cores, that compute the chunks of a sweep.
+
+
+def local_processes(n: int, threads: int = 1) -> Executor:
+    """Processes for `executor=`, which compute on this machine's processor. Each process has its own cores, and uses
+    the parent's compilation cache if there is one. Processes start when chunks arrive. A process that dies is replaced,
+    and its chunk is retried in another one. The processes end with the context or with the parent process. As for all
+    processes that Python's `multiprocessing` starts, put the calls in your script under `if __name__ == "__main__":`.
+
+    **Arguments:** `n`: number of processes; `threads`: number of cores for each.
+
+    **Returns:** the executor, as a context.
+
+    **Raises:** `ValueError` for numbers below 1.
+
+    **Example:** pass it to a table as `executor=processes`.
+
+    ```
+    >>> import nonholonomic
+    >>> with nonholonomic.local_processes(1) as processes:
+    ...     print(processes.submit(sum, [1.0, 2.0]).result())
+    3.0
+
+    ```
+    """
+    for name, value in (("n", n), ("threads", threads)):
+        require(value, name, at_least=1)
+        if value != int(value):
+            raise ValueError(f"{name} = {shown(value)} must be a whole number")
+    return LocalProcesses(int(n), int(threads))
+
+
+#: The arguments and the result of a call.
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class LocalProcesses(Executor):
+    """An executor of single-process pools, so that a process that dies loses only its own call."""
+
+    def __init__(self, n: int, threads: int):
+        """Set the number of processes and the number of cores for each."""
+        self._pools: list[ProcessPoolExecutor | None] = [None] * n
+        self._threads = threads
+        self._free: SimpleQueue[int] = SimpleQueue()
+        for place in range(n):
+            self._free.put(place)
+        self._callers = ThreadPoolExecutor(n)
+
+    def submit(self, function: Callable[P, T], /, *arguments: P.args, **options: P.kwargs) -> Future[T]:
+        """Call a function in one of the processes; its future raises `BrokenProcessPool` if the process dies."""
+        return self._callers.submit(self._called, function, arguments, options)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
+        """End the processes, after the calls that have begun; also at the end of the context."""
+        self._callers.shutdown(wait, cancel_futures=cancel_futures)
+        for pool in self._pools:
+            if pool is not None:
+                pool.shutdown(wait, cancel_futures=cancel_futures)
+
+    def _called(self, function: Callable[..., T], arguments: tuple[object, ...], options: dict[str, object]) -> T:
+        place = self._free.get()
+        try:
+            pool = self._pools[place]
+            if pool is None:
+                pool = self._pools[place] = _started(place, self._threads)
+            return pool.submit(function, *arguments, **options).result()
+        except BrokenProcessPool:
+            self._pools[place] = None
+            raise
+        finally:
+            self._free.put(place)
+
+
+#: A process inherits the cores of the thread that starts it, and the environment, which all threads share.
+_starting = threading.Lock()
+
+
+#: A process that is killed while it starts, by the system if memory is short, is started again, this many times in all.
+MAX_STARTS = 3
+
+
+def _started(place: int, threads: int) -> ProcessPoolExecutor:
+    """A process that has its cores and its settings before its first line runs."""
+    for _ in range(MAX_STARTS):
+        pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
+        with _starting, _starting_in(place, threads):
+            others = multiprocessing.active_children()
+            # The process starts with the first call.
+            first_call = pool.submit(int)
+            started = [process for process in multiprocessing.active_children() if process not in others]
+        try:
+            first_call.result()
+            return pool
+        except BrokenProcessPool as error:
+            pool.shutdown()
+            # The exit status of a process that a signal has ended is negative; one that is no longer listed was ended at once.
+            if started and not any((process.exitcode or 0) < 0 for process in started):
+                # It would end again.
+                raise RuntimeError(
+                    "a process ended before it computed anything; a script that starts processes must have its own calls under "
+                    "`if __name__ == '__main__':`"
+                ) from error
+    raise RuntimeError(
+        f"{MAX_STARTS} processes were killed while they started; if the machine has too little memory, start fewer: "
+        "local_processes(n=...)"
+    )
+
+
+@contextlib.contextmanager
+def _starting_in(place: int, threads: int) -> Iterator[None]:
+    """A context whose processes start with their own environment and cores, and postpone Ctrl-C, as this thread does.
+
+    They compute on the CPU, and share the store of compiled programs. Cores are assigned in turn, and again from the
+    first when none is left.
+    """
+    settings = {"JAX_PLATFORMS": "cpu"}
+    folder = getattr(jax.config, "jax_compilation_cache_dir", None)
+    if folder:
+        settings |= {"JAX_COMPILATION_CACHE_DIR": str(folder), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        settings |= {"JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
+    with contextlib.ExitStack() as stack:
+        old_values = {name: os.environ.get(name) for name in settings}
+        os.environ.update(settings)
+        for name, value in old_values.items():
+            if value is None:
+                stack.callback(os.environ.pop, name)
+            else:
+                stack.callback(os.environ.update, {name: value})
+        if hasattr(os, "sched_setaffinity"):
+            allowed = sorted(os.sched_getaffinity(0))
+            os.sched_setaffinity(0, {allowed[(place * threads + k) % len(allowed)] for k in range(threads)})
+            stack.callback(os.sched_setaffinity, 0, allowed)
+        if hasattr(signal, "pthread_sigmask"):
+            old_signals = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            stack.callback(signal.pthread_sigmask, signal.SIG_SETMASK, old_signals)
+        yield
+
+
+def _begin() -> None:
+    """Prepare a process: Ctrl-C on a terminal also reaches it, and ends it at once without a traceback."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    # This process ends when its parent ends, even if the parent was killed.
+    threading.Thread(target=watch, daemon=True).start()

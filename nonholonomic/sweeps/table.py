@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,8 +16,8 @@ from ..terminal import status_line
 from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html
 from ..validation import as_path, replacing, require_package
 from ..views import draw_portrait, draw_series, draw_table, require_others
-from ._store import MAX_BYTES_IN_MEMORY, Stored, table_path, unfinished, write_file
-from .grid import LONG_NAMES, PENDING, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
+from ._store import Stored, contents_of, table_path, write_file
+from .grid import PENDING, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
 
 if TYPE_CHECKING:
     import pandas
@@ -41,6 +40,7 @@ class Table(eqx.Module):
     - `attributes`: the request and the versions, as plain data.
     - `words`: variable of words -> the words, in the order of their codes in a file.
     - `inner`: variable -> the names of its additional dimensions, which follow those of the grid.
+    - `long_names`: name of a coordinate or variable -> its long name.
 
     **Example:**
 
@@ -64,6 +64,7 @@ class Table(eqx.Module):
     attributes: dict[str, Any]
     words: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
     inner: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
+    long_names: dict[str, str] = eqx.field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Tabulated:
         # Python calls this only for names that are not fields.
@@ -91,11 +92,6 @@ class Table(eqx.Module):
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self]
-
-    @property
-    def long_names(self) -> dict[str, str]:
-        """Long names of coordinates and variables, by name."""
-        return json.loads(self.attributes.get(LONG_NAMES, "{}"))
 
     def label(self, name: str) -> str:
         """The label of a coordinate or variable for plots: its long name with its unit, "inversion time [s]"."""
@@ -142,8 +138,7 @@ class Table(eqx.Module):
             described = {"long_name": self.long_names.get(name), "units": self.units.get(name)}
             described = {key: text for key, text in described.items() if text is not None}
             (variables if name in self.variables else coords)[name] = (dims, self[name], described)
-        attributes = {name: value for name, value in self.attributes.items() if name != LONG_NAMES}
-        dataset = xarray.Dataset(variables, coords, attributes)
+        dataset = xarray.Dataset(variables, coords, self.attributes)
         return dataset if chunks is None else dataset.chunk(chunks)
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -218,7 +213,7 @@ class Table(eqx.Module):
                 codes = {word: code for code, word in enumerate(words[name])} | {UNREACHED: PENDING}
                 arrays[name] = np.vectorize(codes.__getitem__, otypes=[np.int8])(arrays[name])
         kinds = {name: values.dtype for name, values in arrays.items()}
-        layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, CHUNK)
+        layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, CHUNK, self.long_names)
         flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in arrays.items()}
         ends = enumerate(map(layout.ends, range(layout.chunks)))
         cut = ((chunk, {name: values[first:end] for name, values in flat.items()}) for chunk, (first, end) in ends)
@@ -231,23 +226,15 @@ class Table(eqx.Module):
 
         **Raises:** `OSError` that names the path if the file cannot be read or contains no table.
         """
-        file = as_path(path, "path")
-        partial = unfinished(file)
-        return cls.of(Stored(file)) if partial is None else cls.laid_out(*partial)
+        return cls.laid_out(*contents_of(as_path(path, "path")))
 
     @classmethod
-    def of(cls, stored: Stored) -> "Table":
-        """A table whose variables stay in the file; a small table is read at once."""
-        layout = stored.layout
-        if layout.bytes_of_cells(layout.cells) <= MAX_BYTES_IN_MEMORY:
-            return cls.laid_out(layout, {name: stored.whole(name) for name in layout.kinds})
-        return cls(layout.coords, stored, layout.units, layout.attributes, layout.words, layout.inner)
-
-    @classmethod
-    def laid_out(cls, layout: Layout, values: dict[str, Values]) -> "Table":
-        """A table from arrays with all cells along the first axis, and with codes instead of words."""
-        variables = {name: layout.shaped(name, of_cells) for name, of_cells in values.items()}
-        return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
+    def laid_out(cls, layout: Layout, values: Mapping[str, Values]) -> "Table":
+        """A table from arrays with all cells along the first axis and codes instead of words, or from its file."""
+        if not isinstance(values, Stored):
+            values = {name: layout.shaped(name, of_cells) for name, of_cells in values.items()}
+        fields = layout.units, layout.attributes, layout.words, layout.inner, layout.long_names
+        return cls(layout.coords, values, *fields)
 
     def digits(self, variable: str = "time") -> Values:
         """A variable with its correct digits: "5.01142(3)" is 5.01142 with an error of 0.00003.
@@ -486,7 +473,8 @@ def run_table(
     long_names = {"time": "time"} | {name: quantity.long_name for name, quantity in quantities.items()}
     units = {"time": "s"} | {name: quantity.unit for name, quantity in quantities.items()}
     inner = {name: (quantity.components,) for name, quantity in quantities.items() if quantity.components is not None}
-    return Table(coords, values, units, attributes_of(json.dumps(request, default=repr), axes, long_names), inner=inner)
+    attributes = attributes_of(request, axes)
+    return Table(coords, values, units, attributes, {}, inner, long_names)
 
 
 class Tabular(abc.ABC):

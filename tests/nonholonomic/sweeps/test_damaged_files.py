@@ -323,6 +323,6 @@ def test_what_is_not_a_path_is_refused(path):
 
 
 def test_a_number_that_is_missing_in_a_request_is_the_same_again():
-    first, second = (Layout({}, {}, {}, {"request": f'{{"data": [NaN, {x}]}}'}, {}, {}, 1) for x in (1.0, 2.0))
+    first, second = (Layout({}, {}, {}, {"request": f'{{"data": [NaN, {x}]}}'}, {}, {}, 1, {}) for x in (1.0, 2.0))
     assert difference_between(first, first) is None
     assert "data is [nan, 1.0] in the file and [nan, 2.0]" in str(difference_between(first, second))

@@ -190,7 +190,7 @@ def test_one_of_many_writers(tmp_path):
             blocks.close()
 
     attributes = {"request": "{}", "axes": '["x"]', "versions": "{}"}
-    LAYOUT = Layout({"x": np.arange(8.0)}, {"value": np.dtype(float)}, {}, attributes, {}, {}, BLOCK)
+    LAYOUT = Layout({"x": np.arange(8.0)}, {"value": np.dtype(float)}, {}, attributes, {}, {}, BLOCK, {})
     threads = [threading.Thread(target=writer) for _ in range(8)]
     for thread in threads:
         thread.start()

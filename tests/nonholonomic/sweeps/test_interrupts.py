@@ -171,7 +171,7 @@ def test_no_chunk_starts_after_an_interrupt_while_another_is_saved(tmp_path, mon
         begun.append(block)
         assert block == 0 or is_over.wait(60.0)
 
-    monkeypatch.setattr(ChunkStore, "filled", interrupted_while_saving)
+    monkeypatch.setattr(ChunkStore, "fill", interrupted_while_saving)
     with ThreadPoolExecutor(1) as executor:
         # As long as `caught` exists, so do the frames of its traceback.
         with pytest.raises(KeyboardInterrupt) as caught:

@@ -34,7 +34,7 @@ def large_sweep(path, **options):
 
 @pytest.fixture
 def in_its_file(monkeypatch):
-    monkeypatch.setattr("nonholonomic.sweeps.table.MAX_BYTES_IN_MEMORY", 1000)
+    monkeypatch.setattr("nonholonomic.sweeps._store.MAX_BYTES_IN_MEMORY", 1000)
 
 
 def test_a_table_in_its_file_takes_the_memory_of_some_blocks(tmp_path, monkeypatch, in_its_file):
@@ -101,7 +101,7 @@ def test_boxes_hold_the_cells_of_a_block_in_order(shape):
 def test_large_grids_have_larger_blocks(cells, together):
     """About a thousand, until a block takes 2 MB."""
     kinds = dict.fromkeys(["time", "end_time", "end_theta", "steps", "rejected"], np.dtype(float))
-    layout = Layout({"x": np.empty(cells, np.bool_)}, kinds, {}, {}, {}, {}, 512)
+    layout = Layout({"x": np.empty(cells, np.bool_)}, kinds, {}, {}, {}, {}, 512, {})
     assert running.chunks_together(layout, 512) == together
 
 

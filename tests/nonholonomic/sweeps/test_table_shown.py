@@ -24,8 +24,9 @@ def table():
     status = np.where(np.isfinite(time), "inverted", "not_inverted")
     units = {"theta": "rad", "mu": "s m-1", "spin": "rad s-1", "time": "s"}
     names = {"theta": "θ(0)", "mu": "friction μ", "time": "inversion time"}
-    attributes = {"request": "{}", "axes": json.dumps(["theta", "mu", "spin"]), "long_names": json.dumps(names)}
-    return Table({"theta": THETA, "mu": MU, "spin": SPIN}, {"time": time, "status": status}, units, attributes)
+    attributes = {"request": "{}", "axes": json.dumps(["theta", "mu", "spin"])}
+    coords, variables = {"theta": THETA, "mu": MU, "spin": SPIN}, {"time": time, "status": status}
+    return Table(coords, variables, units, attributes, long_names=names)
 
 
 def test_names_are_found_and_completed(table):
