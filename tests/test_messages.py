@@ -13,7 +13,7 @@ from tops import rutstam_top
 import nonholonomic
 import stroller
 import tippe
-from nonholonomic.identification.likelihood import as_free
+from nonholonomic.identification.posterior import as_free
 from nonholonomic.identification.result import check_search
 from nonholonomic.text import shown
 from nonholonomic.views import Page

@@ -16,9 +16,9 @@ Recordings of both vehicles are checked, read from files and converted to `Measu
 0.997
 """
 
-from .likelihood import Free as Free
-from .likelihood import Measurements as Measurements
+from .posterior import Free as Free
 from .posterior import LogDensity as LogDensity
+from .posterior import Measurements as Measurements
 from .recording import AbstractRecording as AbstractRecording
 from .recording import Quantities as Quantities
 from .recording import as_quantity as as_quantity

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .exploration import FARTHEST, ROWS, Explorer, Pool, fitted, squared_distances, weighted_covariance
-from .likelihood import Measurements
-from .posterior import Coordinates, Matrix, PerPoint, Points, Problem, deviances, predictions
+from .posterior import Coordinates, Matrix, Measurements, PerPoint, Points, Problem, deviances, predictions
 from .search import SAME, Minima, minimise
 
 # Only for type checkers: results stand above conclusions.
@@ -102,7 +101,7 @@ def judge(
     """
     from scipy.stats import chi2
 
-    measurements, by_slopes = ends.measurements, ends.covariance(ends.best)
+    measurements, by_slopes = ends.density.measurements, ends.covariance(ends.best)
     prediction, residual = ends.linearised.prediction[ends.best], ends.linearised.residual[ends.best]
     exact = ~np.asarray(measurements.censored)
     missing = int(np.sum(~np.isfinite(prediction[exact])))
@@ -257,8 +256,10 @@ def profiled(fit: "Identification", k: int, values: Float[np.ndarray, " points"]
     For every held value, the other coordinates are drawn around their regression on the held one, then around the best of
     the points so far, in batches of runs without slopes; least squares refine the best ones.
     """
-    problem, estimate = fit.problem, fit.coordinates
-    held = np.asarray(problem.unknowns[k].coordinate(values))
+    problem, estimate = fit.density.problem, fit.coordinates
+    held = problem.unknowns.coordinates(
+        np.where(np.arange(len(estimate)) == k, values[:, None], problem.unknowns.start)
+    )[:, k]
     covariance = np.where(np.isfinite(fit.coordinate_covariance), fit.coordinate_covariance, 0.0)
     random, size, points = np.random.default_rng(0), len(estimate), len(held)
     others = np.arange(size) != k
@@ -277,7 +278,7 @@ def profiled(fit: "Identification", k: int, values: Float[np.ndarray, " points"]
         trial[..., others] += NARROWER**batch * random.normal(size=(points, each, size - 1)) @ root.T
         trial[:, 0] = best
         rows = trial.reshape(-1, size)
-        deviance = deviances(problem, rows, predictions(problem, rows), fit.measurements)
+        deviance = deviances(fit.density, rows, predictions(problem, rows))
         deviance = np.where(np.isfinite(deviance), deviance, np.inf).reshape(points, each)
         place = np.argmin(deviance, axis=1)
         improved = deviance[np.arange(points), place]
@@ -285,12 +286,12 @@ def profiled(fit: "Identification", k: int, values: Float[np.ndarray, " points"]
         least = np.minimum(least, improved)
     converged = np.isfinite(least)
     if size > 1:
-        ends = minimise(problem, best, fit.measurements, fixed=k)
+        ends = minimise(fit.density, best, fixed=k)
         at_ends, converged = ends.linearised.deviance, ends.converged
         improves = np.isfinite(at_ends) & (at_ends <= least)
         best = np.where(improves[:, None], ends.coordinates, best)
         least = np.where(improves, at_ends, least)
-    optima = problem.values(best)
+    optima = problem.unknowns.values(best)
     estimates = {other: optima[:, i] for i, other in enumerate(problem.names) if i != k}
     return Profile(values, least - fit.deviance, estimates, converged)
 
@@ -362,9 +363,11 @@ class Distribution(NamedTuple):
         if self.kind == "weights":
             # Draws without weight may be infinite.
             used = self.weights > 0.0
-            covariance = weighted_covariance(np.asarray(problem.values(self.points[used])), self.weights[used])[1]
+            covariance = weighted_covariance(
+                np.asarray(problem.unknowns.values(self.points[used])), self.weights[used]
+            )[1]
             ends = np.array([self.interval(k, 1.0) for k in range(len(self.estimate))])
-            low, high = np.asarray(problem.values(ends.T))
+            low, high = np.asarray(problem.unknowns.values(ends.T))
             scale = 0.5 * (high - low) / np.sqrt(np.diag(covariance))
             return covariance * np.outer(scale, scale)
         with np.errstate(invalid="ignore"):
@@ -446,7 +449,7 @@ def minima_of(explorer: Explorer, sample: Pool) -> tuple[Minimum, ...]:
     minima = []
     for group in np.unique(groups):
         best = np.flatnonzero(groups == group)[np.argmax(sample.log_density[used][groups == group])]
-        values = dict(zip(problem.names, np.asarray(problem.values(points[best])).tolist(), strict=True))
+        values = dict(zip(problem.names, np.asarray(problem.unknowns.values(points[best])).tolist(), strict=True))
         deviance = float(-2.0 * np.sum(sample.groups[used][best]))
         minima.append(Minimum(values, float(np.sum(weights[groups == group])), deviance))
     return tuple(sorted((minimum for minimum in minima if minimum.weight > LEAST_WEIGHT), key=lambda m: -m.weight))
@@ -479,7 +482,7 @@ def without_prediction(explorer: Explorer, sample: Pool, distribution: Distribut
     points, failed = points[evaluated], np.any(np.isnan(sample.predictions[evaluated]), axis=1)
     if not np.any(failed):
         return "", 0.0
-    values = np.asarray(problem.values(points[failed]))
+    values = np.asarray(problem.unknowns.values(points[failed]))
     ends = zip(problem.names, np.min(values, axis=0), np.max(values, axis=0), strict=True)
     places = ", ".join(f"{name} {low:.4g}" + (f" to {high:.4g}" if high > low else "") for name, low, high in ends)
     words = (
@@ -499,16 +502,16 @@ def remarks(
     """What is special about the shape of a posterior: concerns and notes, in words."""
     problem, region, weights = explorer.density.problem, explorer.region, sample.weights
     concerns, notes, skewed = [], [], []
-    for k, (name, unknown) in enumerate(zip(problem.names, problem.unknowns, strict=True)):
+    values = problem.unknowns.values(sample.points)
+    for k, name in enumerate(problem.names):
         # A bound, or the edge of the searched region, that cuts the interval of the unknown.
         coordinate, middle, reach = sample.points[:, k], region.middle[k], FARTHEST * region.half_width[k]
         for side, edge in (("below", middle - reach), ("above", middle + reach)):
             if np.sum(weights[np.abs(coordinate - edge) < NEAR * 2.0 * reach]) > CUT:
                 concerns.append(f"the data do not bound {name} from {side}: its interval ends where the search ended")
-        values = np.asarray(unknown.value(coordinate))
-        low, high = quantiles(values, weights, np.array([0.025, 0.975]))
-        for bound, exists in ((unknown.lower, unknown.has_lower), (unknown.upper, unknown.has_upper)):
-            if exists and np.sum(weights[np.abs(values - bound) < NEAR * (high - low)]) > CUT:
+        low, high = quantiles(values[:, k], weights, np.array([0.025, 0.975]))
+        for bound in (problem.unknowns.lower[k], problem.unknowns.upper[k]):
+            if np.isfinite(bound) and np.sum(weights[np.abs(values[:, k] - bound) < NEAR * (high - low)]) > CUT:
                 concerns.append(f"the bound {float(bound):g} cuts the interval of {name}")
         low, high = distribution.interval(k, 1.96)
         sides = high - distribution.estimate[k], distribution.estimate[k] - low

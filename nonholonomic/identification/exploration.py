@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..terminal import Progress
-from .likelihood import Measurements, Unknown, own_name
-from .posterior import Coordinates, LogDensity, Matrix, PerPoint, Points, Rows, compared
+from .posterior import Coordinates, LogDensity, Matrix, Measurements, PerPoint, Points, compared, own_name, scale_of
 
 # The likelihood of measurements whose errors are unknown: the mean over the errors, with a flat prior of their
 # logarithms.
@@ -48,14 +47,9 @@ def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.n
     for number in np.unique(series[estimated]):
         members = (series == number) & estimated
         z = np.where(np.isfinite(difference[:, members]), difference[:, members], residual[:, members])
-        count, nu = z.shape[1], freedom[members][0]
-        scale = np.sqrt(np.mean(z**2, axis=1)) + 1e-150
-        if np.isfinite(nu):
-            for _ in range(20):
-                weight = (nu + 1.0) / (nu + (z / scale[:, None]) ** 2)
-                scale = np.sqrt(np.mean(weight * z**2, axis=1)) + 1e-150
+        count, nu = z.shape[1], float(freedom[members][0])
         reach = RANGE / np.sqrt(2.0 * count)
-        scales = np.log(scale)[:, None] + np.linspace(-reach, 2.0 * reach, GRID)
+        scales = np.log(scale_of(z, nu))[:, None] + np.linspace(-reach, 2.0 * reach, GRID)
         logs = np.empty(scales.shape)
         for k in range(GRID):
             squares = (z / np.exp(scales[:, k : k + 1])) ** 2
@@ -230,13 +224,13 @@ class Region(NamedTuple):
         return np.all(np.abs(points - self.middle) <= FARTHEST * self.half_width, axis=1)
 
 
-def range_of(name: str, unknown: Unknown, prior: Any, spread: float, duration: float) -> tuple[float, float]:
-    """The ends of the range in which an unknown is searched, in its coordinate.
+def region_of(density: LogDensity, spread: float, duration: float) -> Region:
+    """The region in which the unknowns of a density are searched.
 
-    The range is, by the first of these rules that applies:
+    The range of an unknown is, by the first of these rules that applies:
 
-    - between two bounds: the whole range;
     - with a Gaussian prior: `DEVIATIONS` standard deviations around its mean, within the bounds;
+    - between two bounds: the whole range;
     - `t0`: `OF_DURATION` of the longest recording around the start value, in both directions;
     - a number of a launch or a start: `OF_LAUNCH` of the start value (0.1 where it is 0) in both directions, within the
       bounds;
@@ -245,26 +239,32 @@ def range_of(name: str, unknown: Unknown, prior: Any, spread: float, duration: f
 
     Except for the first two rules, its middle is the start value.
 
-    **Arguments:** `prior`: as in `LogDensity`, or `None`; `spread`: greater than 1; `duration`: of the longest recording [s],
-    0 if there is none.
+    **Arguments:** `spread`: greater than 1; `duration`: of the longest recording [s], 0 if there is none.
     """
-    kind, middle, gaussian = own_name(name), float(unknown.start), None if callable(prior) else prior
-    if unknown.has_lower and unknown.has_upper and gaussian is None:
-        return -5.0, 5.0
-    if gaussian is not None:
-        middle, reach = float(gaussian[0]), DEVIATIONS * float(gaussian[1])
-    elif kind == "t0" and duration > 0.0:
-        reach = OF_DURATION * duration
-    elif kind.startswith(("launch", "start")):
-        reach = OF_LAUNCH * (abs(middle) or 1.0)
-    else:
-        start = float(unknown.coordinate(middle))
-        half = math.log(spread) if unknown.has_lower or unknown.has_upper else spread - 1.0
-        return start - half, start + half
+    unknowns, names = density.problem.unknowns, map(own_name, density.problem.names)
+    start, lower, upper = map(np.asarray, (unknowns.start, unknowns.lower, unknowns.upper))
+    has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
+    middle, reach = start.copy(), np.full(len(start), np.nan)
+    for k, (name, prior) in enumerate(zip(names, unknowns.priors, strict=True)):
+        if prior is not None and not callable(prior):
+            middle[k], reach[k] = prior[0], DEVIATIONS * prior[1]
+        elif has_lower[k] and has_upper[k]:
+            continue
+        elif name == "t0" and duration > 0.0:
+            reach[k] = OF_DURATION * duration
+        elif name.startswith(("launch", "start")):
+            reach[k] = OF_LAUNCH * (abs(middle[k]) or 1.0)
     # Stay away from the bounds, where coordinates are infinite.
     margin = 0.05 * reach
-    low, high = max(middle - reach, unknown.lower + margin), min(middle + reach, unknown.upper - margin)
-    return float(unknown.coordinate(low)), float(unknown.coordinate(max(high, low + margin)))
+    low = np.maximum(middle - reach, lower + margin)
+    high = np.maximum(np.minimum(middle + reach, upper - margin), low + margin)
+    by_factor = np.where(has_lower | has_upper, math.log(spread), spread - 1.0) * np.array([[-1.0], [1.0]])
+    ends = np.select(
+        [np.isfinite(reach), has_lower & has_upper],
+        [unknowns.coordinates(np.stack([low, high])), np.array([[-5.0], [5.0]])],
+        unknowns.coordinates(start) + by_factor,
+    )
+    return Region(np.mean(ends, axis=0), 0.5 * np.ptp(ends, axis=0))
 
 
 #: Greatest number of points that are evaluated together, and of points in a round; the program of the priors has as many rows.
@@ -358,21 +358,21 @@ class Explorer(NamedTuple):
     region: Region
     group: np.ndarray
     rows: int
+    seed: int
     random: np.random.Generator
 
     @classmethod
     def of(cls, density: LogDensity, spread: float, seed: int) -> "Explorer":
-        """An explorer of the region around start values, as for `range_of`, with measurements grouped by their times."""
-        times, problem = np.asarray(density.measurements.time), density.problem
-        free = zip(problem.names, problem.unknowns, strict=True)
+        """An explorer of the region around start values, as for `region_of`, with measurements grouped by their times."""
+        times = np.asarray(density.measurements.time)
         distinct, duration = np.unique(times), float(np.max(times))
         count = min(GROUPS, len(distinct))
         group = (np.searchsorted(distinct, times) * count) // len(distinct)
-        ends = np.array([range_of(name, unknown, density.priors.get(name), spread, duration) for name, unknown in free])
-        region = Region(np.mean(ends, axis=1), 0.5 * np.ptp(ends, axis=1))
-        return cls(density, region, group, ROWS if len(ends) > 1 else ROWS // 8, np.random.default_rng(seed))
+        region = region_of(density, spread, duration)
+        rows = ROWS if len(region.middle) > 1 else ROWS // 8
+        return cls(density, region, group, rows, seed, np.random.default_rng(seed))
 
-    def begin(self, seed: int) -> Pool:
+    def begin(self) -> Pool:
         """A pool of quasi-random points in the region."""
         values, groups = self.density.measurements.value.size, int(np.max(self.group)) + 1
         size = len(self.region.middle)
@@ -380,7 +380,7 @@ class Explorer(NamedTuple):
         empty = Pool(*(np.zeros(shape) for shape in shapes), proposals=())
         # The valleys of recordings are narrow.
         count = ROWS if size > 2 else ROWS // 2 if size == 2 else ROWS // 4 if groups > 1 else self.rows
-        return self.extended(empty, self.region.points(count, seed), self.region)
+        return self.extended(empty, self.region.points(count, self.seed), self.region)
 
     def acting(self, pool: Pool) -> Bool[np.ndarray, " unknowns"]:
         """Which unknowns act: moved from one of the two best points to the farther end of its range, such an unknown changes a
@@ -394,16 +394,16 @@ class Explorer(NamedTuple):
             moved = np.repeat(points[:, None], len(middle), axis=1)
             ends = middle + np.where(points > middle, -half_width, half_width)
             np.einsum("bkk->bk", moved)[:] = ends
-            predictions = self.density.predictions(np.concatenate([points, moved.reshape(-1, len(middle))]))
+            predictions = self.density.predict(np.concatenate([points, moved.reshape(-1, len(middle))]))
             base, others = predictions[: len(points), None], predictions[len(points) :].reshape(*ends.shape, -1)
         with np.errstate(invalid="ignore"):
             change = np.abs(others - base) / np.asarray(self.density.measurements.error)
         is_same = np.all((others == base) | (change < NO_CHANGE), axis=(0, 2))
-        free = zip(self.density.problem.names, self.density.problem.unknowns, strict=True)
-        has_end = [name in self.density.priors or (u.has_lower and u.has_upper) for name, u in free]
-        return ~is_same | np.array(has_end)
+        unknowns = self.density.problem.unknowns
+        has_prior = np.array([prior is not None for prior in unknowns.priors])
+        return ~is_same | has_prior | np.isfinite(unknowns.upper - unknowns.lower)
 
-    def extended(self, pool: Pool, points: Rows, proposal: Region | Mixture) -> Pool:
+    def extended(self, pool: Pool, points: Points, proposal: Region | Mixture) -> Pool:
         """The pool with points that were drawn from a proposal."""
         predictions, each, prior, log_density = self.evaluated(points)
         groups = np.stack([np.sum(each[:, self.group == k], axis=1) for k in range(pool.groups.shape[1])], axis=1)
@@ -450,7 +450,7 @@ class Explorer(NamedTuple):
         mixture = halves[0].joined(halves[1], 0.5)
         return mixture if minima is None else mixture.joined(minima, share)
 
-    def evaluated(self, points: Rows) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def evaluated(self, points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Predictions, log likelihoods of all measurements, log priors and log densities of at most `ROWS` points.
 
         The likelihood of a measurement is that with its stated or guessed error; the density is averaged over unknown errors.
@@ -459,13 +459,14 @@ class Explorer(NamedTuple):
         # Rows of NaN take no time. The program of the priors is compiled for `ROWS` rows.
         batch = np.full((ROWS, points.shape[1]), np.nan)
         batch[: len(points)][inside] = points[inside]
-        measurements, predictions = self.density.measurements, self.density.predictions(batch[: len(points)])
+        measurements, predictions = self.density.measurements, self.density.predict(batch[: len(points)])
         residual = compared(measurements, predictions)[0]
         each, estimated = -0.5 * residual**2, np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
         likelihood = np.sum(each[:, ~estimated], axis=1)
         for scales, logs in _by_error(measurements, predictions, residual):
             likelihood = likelihood + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])
-        prior = np.where(inside, self.density.log_priors(batch)[: len(points)], -np.inf)
+        prior = np.asarray(self.density.problem.unknowns.log_priors(batch))
+        prior = np.where(inside, prior[: len(points)], -np.inf)
         return predictions, each, prior, likelihood + prior
 
 

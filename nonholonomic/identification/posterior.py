@@ -1,21 +1,406 @@
-"""A model with its free parameters, and the posterior of these as a function of unbounded coordinates."""
+"""Measurements and unknown parameters, a model with its unknowns, and their posterior as a function of coordinates."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jax.scipy.special import log_ndtr
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..sweeps.running import workers
 from ..terminal import status_line
 from ..text import shown
-from ..validation import is_traced
-from .likelihood import Free, Measurements, Unknown, as_free, as_gaussian
+from ..validation import ArrayOrList, is_traced, require
+
+# Compare predictions with measurements: residuals whose squares add up to -2 log likelihood.
+
+#: Residual of a measurement for which the model has no prediction: a penalty without a slope.
+MISSING = 1e4
+
+#: Number of steps in which the scale of values with Student's t distribution is found.
+SCALE_STEPS = 50
+
+
+class Measurements(eqx.Module):
+    """Measured numbers with independent errors.
+
+    **Arguments:**
+
+    - `value`: (n,), the measured values. Where `censored`, a lower limit of the quantity, which also has an error (a
+      clock stopped by hand is uncertain); -inf if the quantity is only known to be below `upper`.
+    - `error`: (n,), standard deviations, positive; or one scalar for all.
+    - `censored`: (n,), which values are lower limits; none by default.
+    - `upper`: (n,), upper limits of the quantities: `value` itself for measured values (the default), infinite if there
+      is only a lower limit.
+    - `period`: (n,), period of a quantity, such as 2 pi for an azimuth; infinite by default.
+    - `student`: (n,), degrees of freedom of Student's t distribution, if the errors have this distribution with the
+      scale `error`; infinite by default, for Gaussian errors. Limits always have Gaussian errors.
+    - `series`: (n,), index of the series to which a value belongs; 0 by default. Within a series, values are in the
+      order of measurement.
+    - `time`: (n,) [s], time of a sample since the start of its recording; 0 by default. A fit first uses the early
+      samples of a recording.
+    - `estimated`: (n,), whether `error` is only a start value, and the error is to be estimated from the residuals of
+      the series.
+
+    **Raises:** `ValueError` for numbers that are not finite or shapes that do not match.
+
+    **Example:** two values, and a lower limit.
+
+    >>> from nonholonomic.identification import Measurements
+    >>> Measurements([1.0, 2.0, 3.0], 0.1, censored=[False, False, True]).upper.tolist()
+    [1.0, 2.0, inf]
+    """
+
+    value: Float[Array, "... n"]
+    error: Float[Array, "... n"]
+    upper: Float[Array, "... n"]
+    period: Float[Array, "... n"]
+    student: Float[Array, "... n"]
+    series: Int[Array, "... n"]
+    time: Float[Array, "... n"]
+    estimated: Bool[Array, "... n"]
+
+    def __init__(
+        self,
+        value: ArrayOrList,
+        error: ArrayOrList,
+        censored: ArrayOrList = False,
+        *,
+        upper: ArrayOrList | None = None,
+        period: ArrayOrList = math.inf,
+        student: ArrayOrList = math.inf,
+        series: ArrayOrList = 0,
+        time: ArrayOrList = 0.0,
+        estimated: ArrayOrList = False,
+    ):
+        require(error, "error", above=0.0)
+        if np.ndim(value) == 0 or np.size(value) == 0:
+            raise ValueError(f"value must be a non-empty list, not of shape {np.shape(value)}")
+        shape = np.shape(value)
+        arguments = {"error": error, "censored": censored, "period": period, "student": student}
+        for name, argument in (arguments | {"upper": 0.0 if upper is None else upper}).items():
+            if np.shape(argument) not in ((), shape):
+                raise ValueError(
+                    f"{name} must be one number or of the shape {shape} of value, not {np.shape(argument)}"
+                )
+        value = np.asarray(value, float)
+        upper = np.where(censored, np.inf, value) if upper is None else np.broadcast_to(upper, shape)
+        require(value[~(np.isneginf(value) & np.isfinite(upper))], "value")
+        if np.any(np.isnan(upper)) or np.any(upper < value):
+            raise ValueError(f"upper = {shown(upper)} must be at least value")
+        for name in ("period", "student"):
+            if not np.all(np.asarray(arguments[name]) > 0.0):
+                raise ValueError(f"{name} = {shown(arguments[name])} must be positive, or infinite")
+
+        fields = {"value": value, "upper": upper, "error": error, "period": period, "student": student}
+        for name, argument in (fields | {"series": series, "time": time, "estimated": estimated}).items():
+            kind = {"series": int, "estimated": bool}.get(name, float)
+            setattr(self, name, jnp.broadcast_to(jnp.asarray(argument, kind), shape))
+
+    @property
+    def censored(self) -> Bool[Array, "... n"]:
+        """Which measurements are limits, or pairs of limits."""
+        return self.upper > self.value
+
+    def residuals(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """Residuals whose squares are -2 log likelihood, up to a constant.
+
+        For a measurement the residual is z = (prediction - value) / error, or with Student's t of nu degrees of freedom
+        r = sign(z) sqrt((nu + 1) log(1 + z^2 / nu)). For a lower limit, the residual is r = -sqrt(-2 log Phi(z)), where
+        Phi is the normal distribution: close to z if the prediction is far below the limit, and close to 0 if the
+        prediction is above the limit. Upper limits are the mirror image. `between` states the residual of two limits. A
+        prediction that is not finite counts as `MISSING`, except that an infinite prediction exceeds a lower limit.
+
+        **Arguments:** `prediction`: (..., n). **Returns:** (..., n).
+        """
+        is_finite = jnp.isfinite(prediction)
+        finite_prediction = jnp.where(is_finite, prediction, 0.0)
+        low, high = jnp.isfinite(self.value), jnp.isfinite(self.upper)
+        excess = (finite_prediction - jnp.where(low, self.value, 0.0)) / self.error
+        shortfall = (jnp.where(high, self.upper, 0.0) - finite_prediction) / self.error
+        two_limits = low & high & self.censored
+        middle = jnp.where(two_limits, 0.5 * (self.value + self.upper), 0.0)
+        half = jnp.where(two_limits, 0.5 * (self.upper - self.value) / self.error, 1.0)
+        z, heavy = self.standardised(finite_prediction), jnp.isfinite(self.student)
+        freedom = jnp.where(heavy, self.student, 1.0)
+        share = z**2 / freedom
+        # log(1 + q) / q without 0 / 0; divided before the square root, whose slope at 0 is infinite.
+        is_small = share < 1e-8
+        flat = jnp.where(is_small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(is_small, 1.0, share))
+        of_value = jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
+        residuals = jnp.select(
+            [~self.censored, two_limits, low],
+            [of_value, between((finite_prediction - middle) / self.error, half), one_sided(excess)],
+            -one_sided(shortfall),
+        )
+        is_exceeded = low & ~high & (prediction == jnp.inf)
+        return jnp.where(is_finite, residuals, jnp.where(is_exceeded, 0.0, MISSING))
+
+    def whole_periods(self, off: Float[Array | np.ndarray, "... n"]) -> Any:
+        """Differences rounded to the nearest whole period, without a slope; a NumPy array for a NumPy array, because JAX
+        would compile for every number of rows."""
+        xp: Any = np if isinstance(off, np.ndarray) else jnp
+        period = xp.asarray(self.period)
+        wraps = xp.isfinite(period)
+        period = xp.where(wraps, period, 1.0)
+        return xp.where(wraps, period * xp.round(off / period), 0.0)
+
+    def standardised(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
+        """(prediction - value) / error, with whole periods removed; 0 for limits."""
+        difference = jnp.where(self.censored, 0.0, prediction - self.value)
+        difference = difference - self.whole_periods(difference)
+        return difference / self.error
+
+    def roots_of_information(
+        self, prediction: Float[Array | np.ndarray, "... n"], slope: Float[Array, "... n"]
+    ) -> Float[Array, "... n"]:
+        """Square roots of Fisher's information about the predictions, from the expected curvature, for standard errors:
+        1 / error for Gaussian errors, sqrt((nu + 1) / (nu + 3)) / error for Student's t; the slope of the residual for
+        limits.
+        """
+        heavy = jnp.isfinite(self.student)
+        freedom = jnp.where(heavy, self.student, 1.0)
+        expected = jnp.where(heavy, jnp.sqrt((freedom + 1.0) / (freedom + 3.0)), 1.0) / self.error
+        return jnp.where(self.censored | ~jnp.isfinite(prediction), slope, expected)
+
+    def log_likelihood(self, prediction: Float[Array, "... n"]) -> Float[Array, "..."]:
+        """The log likelihood up to a constant that depends on neither predictions nor errors."""
+        measured = jnp.where(self.censored, 0.0, jnp.log(self.error))
+        return -jnp.sum(0.5 * self.residuals(prediction) ** 2 + measured, axis=-1)
+
+    def with_errors(self, error: Float[Array | np.ndarray, "... n"]) -> "Measurements":
+        """The same measurements with other errors."""
+        return eqx.tree_at(lambda measurements: measurements.error, self, jnp.broadcast_to(error, self.error.shape))
+
+
+def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The residual -sqrt(-2 log Phi(z)) of a lower limit; 0 if its magnitude is less than 1e-9."""
+    # Beyond this, the derivative of the square root would be infinity times zero.
+    in_range = z < 9.0
+    return jnp.where(in_range, -jnp.sqrt(-2.0 * log_ndtr(jnp.where(in_range, z, 0.0))), 0.0)
+
+
+def between(z: Float[Array, "..."], half: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The residual of two limits: sign(z) sqrt(2 log(P(0) / P(z))), P(z) = Phi(half - z) - Phi(-half - z).
+
+    **Arguments:** `z`: distance of the prediction above the middle, in errors; `half`: half the distance of the limits,
+    in errors.
+    """
+
+    def log_probability(distance: Float[Array, "..."]) -> Float[Array, "..."]:
+        upper, lower = log_ndtr(half - distance), log_ndtr(-half - distance)
+        return upper + jnp.log(-jnp.expm1(lower - upper))
+
+    # Near the middle, use z times the root of the curvature, 2 half phi(half) / P(0): the difference of logarithms
+    # cancels there.
+    distance = jnp.abs(z)
+    deviance = 2.0 * (log_probability(jnp.zeros_like(distance)) - log_probability(distance))
+    at_middle = deviance < 1e-9
+    density = jnp.exp(-0.5 * half**2) / math.sqrt(2.0 * math.pi)
+    curvature = 2.0 * half * density / jnp.exp(log_probability(jnp.zeros_like(distance)))
+    return jnp.where(at_middle, z * jnp.sqrt(curvature), jnp.sign(z) * jnp.sqrt(jnp.where(at_middle, 1.0, deviance)))
+
+
+def scale_of(off: Float[np.ndarray, "rows n"], freedom: float, share: float = 1.0) -> Float[np.ndarray, " rows"]:
+    """The scale of the values in every row: the root of the sum of their squares / (n share). For Student's t, it is the
+    scale for which the mean weight of the squares is 1 (maximum likelihood)."""
+    scale = np.sqrt(np.mean(off**2, axis=-1) / share) + 1e-150
+    for _ in range(SCALE_STEPS if math.isfinite(freedom) else 0):
+        weight = (freedom + 1.0) / (freedom + (off / scale[..., None]) ** 2)
+        scale = np.sqrt(np.mean(weight * off**2, axis=-1) / share) + 1e-150
+    return scale
+
+
+def estimated_errors(
+    measurements: Measurements, prediction: Float[np.ndarray, " n"], unknowns: int
+) -> Float[np.ndarray, " n"]:
+    """The errors; unknown errors are estimated from the residuals of their series.
+
+    In a fit of k unknowns to N values, the share of the residuals that is left of the errors is 1 - k / N.
+    """
+    errors = np.array(measurements.error)
+    series, estimated, freedom = map(np.asarray, (measurements.series, measurements.estimated, measurements.student))
+    off = np.asarray(measurements.standardised(prediction)) * errors
+    share = max(1.0 - unknowns / off.size, 1.0 / off.size)
+    for number in np.unique(series[estimated]):
+        members = (series == number) & estimated
+        seen = off[members & np.isfinite(off)]
+        errors[members] = scale_of(seen[None], freedom[members][0].item(), share) if len(seen) else 1.0
+    return errors
+
+
+# Unknown parameters: start value, bounds, and the coordinate in which they are fitted.
+
+
+class Free(NamedTuple):
+    """A parameter to be fitted.
+
+    With a lower bound, the fit uses the logarithm of the distance from it (for `lower=0.0`, the logarithm of the
+    parameter); between two bounds, the logit of the position between them; without bounds, the parameter itself.
+
+    - `start`: value from which the fit starts, strictly within the bounds.
+    - `lower`, `upper`: bounds, which a fit approaches but does not reach.
+    - `prior`: mean and standard deviation of a Gaussian prior of the parameter itself; or only the standard deviation,
+      if the mean is `start`; or `None`.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> mu = tippe.Free(0.3, lower=0.0, prior=(0.3, 0.1))
+    >>> mu.start, mu.positive
+    (0.3, True)
+
+    ```
+    """
+
+    start: float
+    lower: float = -math.inf
+    upper: float = math.inf
+    prior: tuple[float, float] | float | None = None
+
+    @property
+    def unit(self) -> float:
+        """The unit of changes of the parameter: the size of the start value; if this is 0, the prior's standard
+        deviation, or 1."""
+        return abs(self.start) or (1.0 if self.prior is None else float(np.ravel(self.prior)[-1]))
+
+    @property
+    def positive(self) -> bool:
+        """Whether the parameter cannot be negative."""
+        return self.lower >= 0.0
+
+
+def as_gaussian(prior: Any, start: float, name: str) -> tuple[float, float]:
+    """Mean and standard deviation of a prior, which may be only a standard deviation about the start value.
+
+    **Raises:** `ValueError` that names the unknown.
+    """
+    if np.shape(prior) not in ((), (2,)):
+        raise ValueError(
+            f"prior of {name} = {shown(prior)} must be a mean and a standard deviation, or only the standard deviation"
+        )
+    mean, deviation = (start, prior) if np.ndim(prior) == 0 else prior
+    require(mean, f"mean of the prior of {name}")
+    require(deviation, f"standard deviation of the prior of {name}", above=0.0)
+    return mean, deviation
+
+
+#: The log density of a parameter: (mean, standard deviation) of a Gaussian, only the standard deviation, or a function of the
+#: parameter.
+Prior = tuple[float, float] | float | Callable[[Float[Array, ""]], Float[Array, ""]]
+
+
+class Unknowns(eqx.Module):
+    """The free parameters of a compiled program, which takes their numbers as arguments.
+
+    - `start`, `unit`, `lower`, `upper`: (unknowns,), as for `Free`.
+    - `priors`: for each unknown, mean and standard deviation of a Gaussian prior; a function that returns the log density of
+      the parameter; or `None`.
+    """
+
+    start: Float[Array | np.ndarray, " unknowns"]
+    unit: Float[Array | np.ndarray, " unknowns"]
+    lower: Float[Array | np.ndarray, " unknowns"]
+    upper: Float[Array | np.ndarray, " unknowns"]
+    priors: tuple[Any, ...]
+
+    def __init__(self, free: Mapping[str, Free], priors: Mapping[str, Prior]):
+        numbers = [(unknown.start, unknown.unit, unknown.lower, unknown.upper) for unknown in free.values()]
+        self.start, self.unit, self.lower, self.upper = np.array(numbers, float).T
+        own_priors = (priors.get(name, unknown.prior) for name, unknown in free.items())
+        self.priors = tuple(np.asarray(prior, float) if isinstance(prior, tuple) else prior for prior in own_priors)
+
+    def values(self, coordinates: Float[Array | np.ndarray, "*batch unknowns"]) -> Any:
+        """The parameters at given coordinates; in NumPy for a NumPy array, because JAX would compile for every shape."""
+        xp: Any = np if isinstance(coordinates, np.ndarray) and isinstance(self.start, np.ndarray) else jnp
+        low, high = xp.isfinite(self.lower), xp.isfinite(self.upper)
+        lower, upper = xp.where(low, self.lower, 0.0), xp.where(high, self.upper, 0.0)
+        # 1 / (1 + exp(-x)) without an overflow.
+        between = lower + (upper - lower) * 0.5 * (1.0 + xp.tanh(0.5 * coordinates))
+        # The functions of a single bound are evaluated only where they are used: their slopes may be infinite elsewhere.
+        above, below = xp.where(low & ~high, coordinates, 0.0), xp.where(high & ~low, coordinates, 0.0)
+        # A coordinate that is large enough stands for infinity.
+        with np.errstate(over="ignore"):
+            of_one_bound = [lower + xp.exp(above), upper - xp.exp(-below)]
+        free = self.start + self.unit * coordinates
+        return xp.select([low & high, low, high], [between, *of_one_bound], free)
+
+    def coordinates(self, values: Float[np.ndarray, "*batch unknowns"]) -> Float[np.ndarray, "*batch unknowns"]:
+        """The coordinates of values strictly within the bounds; the inverse of `values`."""
+        low, high = np.isfinite(self.lower), np.isfinite(self.upper)
+        # Logarithms of infinite distances are not used.
+        with np.errstate(invalid="ignore"):
+            above, below = np.log(values - self.lower), np.log(self.upper - values)
+            between = above - below
+        return np.select([low & high, low, high], [between, above, -below], (values - self.start) / self.unit)
+
+    @eqx.filter_jit
+    def prior_residuals(self, coordinates: Float[Array, "rows unknowns"]) -> tuple[Array, Array]:
+        """Residuals of the Gaussian priors in every row, and their slopes with respect to the coordinates."""
+        values, slopes = jax.jvp(self.values, (coordinates,), (jnp.ones_like(coordinates),))
+        places = np.array([k for k, prior in enumerate(self.priors) if prior is not None and not callable(prior)], int)
+        mean, deviation = jnp.array([self.priors[k] for k in places]).reshape(-1, 2).T
+        by_own_coordinate = (slopes[:, places] / deviation)[..., None]
+        return (values[:, places] - mean) / deviation, by_own_coordinate * jnp.eye(len(self.priors))[places]
+
+    def log_prior(self, coordinates: Float[Array, " coordinates"]) -> Float[Array, ""]:
+        """The log density of the priors in the coordinates: the density of each parameter, and the Jacobian of its
+        coordinate. The coordinates of unknown errors, which come last, have a flat prior."""
+        own = jnp.asarray(coordinates)[: len(self.priors)]
+        values, slopes = jax.jvp(self.values, (own,), (jnp.ones_like(own),))
+        # Uniform between two bounds; in the coordinate, the prior would have no finite integral.
+        is_proper = np.array([prior is not None for prior in self.priors])
+        is_proper = is_proper | (jnp.isfinite(self.lower) & jnp.isfinite(self.upper))
+        total = jnp.sum(jnp.log(jnp.abs(jnp.where(is_proper, slopes, 1.0))))
+        for value, prior in zip(values, self.priors, strict=True):
+            if callable(prior):
+                log_density: Any = prior(value)
+                total += log_density
+            elif prior is not None:
+                mean, deviation = prior
+                total += -0.5 * ((value - mean) / deviation) ** 2 - jnp.log(deviation * math.sqrt(2.0 * math.pi))
+        return total
+
+    # Without the data, so that one program serves all fits with as many unknowns.
+    log_priors = eqx.filter_jit(eqx.filter_vmap(log_prior, in_axes=(None, 0)))
+
+
+def as_free(free: Mapping[str, Free | float]) -> dict[str, Free]:
+    """Unknowns as `Free`, checked.
+
+    **Arguments:** `free`: name -> a `Free`, or only the start value.
+
+    **Returns:** name -> `Free`.
+
+    **Raises:** `ValueError` that names the unknown and the problem.
+    """
+    if not isinstance(free, Mapping) or not free:
+        raise ValueError(f"free = {shown(free)} must be a non-empty dictionary, name of a number -> start value")
+    unknowns = {}
+    for name, start in free.items():
+        unknown = start if isinstance(start, Free) else Free(start)
+        require(unknown.start, f"start of {name}")
+        if np.ndim(unknown.start) != 0:
+            raise ValueError(f"start of {name} must be one number, not of shape {np.shape(unknown.start)}")
+        require(unknown.start, f"start of {name}", above=unknown.lower, below=unknown.upper, why="the bounds")
+        prior = None if unknown.prior is None else as_gaussian(unknown.prior, float(unknown.start), name)
+        unknowns[name] = unknown._replace(
+            start=float(unknown.start), lower=float(unknown.lower), upper=float(unknown.upper), prior=prior
+        )
+    return unknowns
+
+
+def own_name(name: str) -> str:
+    """The name of a parameter without the prefix `data[k].`."""
+    return name.split(".", 1)[1] if name.startswith("data[") else name
+
 
 # A model with its free parameters, and predictions with slopes, for many sets of parameters at once.
 
@@ -45,33 +430,30 @@ class Problem(eqx.Module):
     """A model and its free parameters.
 
     - `model`: parameters, name -> (rows,), to predictions (rows, n).
-    - `names`, `unknowns`: the names of the free parameters, and the parameters.
+    - `names`, `unknowns`: the names of the free parameters, and their numbers.
     - `step`: `None` for automatic differentiation in forward mode; otherwise the step of central differences in the
       coordinates. The model then need not be differentiable, nor traceable if it has `on_host = True`.
+    - `on_host`: whether the model cannot be traced.
     - `acts`: which unknowns act on a prediction; the slopes of the others are round-off, and set to zero.
     """
 
     model: Model
     names: tuple[str, ...] = eqx.field(static=True)
-    unknowns: tuple[Unknown, ...]
+    unknowns: Unknowns
     step: float | None = eqx.field(static=True)
+    on_host: bool = eqx.field(static=True)
     acts: Bool[np.ndarray, " unknowns"]
 
-    def __init__(self, model: Model, free: Mapping[str, Free], step: float | None = None):
-        self.model, self.step = model, step
-        self.names = tuple(free)
-        self.unknowns = tuple(map(Unknown.of, free.values()))
-        self.acts = np.ones(len(free), bool)
-
-    def values(self, coordinates: Float[Array | np.ndarray, "... unknowns"]) -> Any:
-        """The parameters at given coordinates, a NumPy array for a NumPy array."""
-        stack: Any = np.stack if isinstance(coordinates, np.ndarray) else jnp.stack
-        return stack([unknown.value(coordinates[..., k]) for k, unknown in enumerate(self.unknowns)], axis=-1)
-
-    @property
-    def on_host(self) -> bool:
-        """Whether the model cannot be traced."""
-        return getattr(self.model, "on_host", False)
+    def __init__(
+        self,
+        model: Model,
+        free: Mapping[str, Free],
+        step: float | None = None,
+        priors: Mapping[str, Prior] = MappingProxyType({}),
+    ):
+        """**Arguments:** `priors`: name -> the prior of an unknown, as in `Unknowns`, in place of its own one."""
+        self.model, self.names, self.step, self.on_host = model, tuple(free), step, getattr(model, "on_host", False)
+        self.unknowns, self.acts = Unknowns(free, priors), np.ones(len(free), bool)
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
         """The model's predictions in every row.
@@ -83,7 +465,7 @@ class Problem(eqx.Module):
                 "a model of tops with several modes cannot be compiled or differentiated: use `sample`, or a sampler that "
                 "needs values only"
             )
-        values = self.values(coordinates)
+        values = self.unknowns.values(coordinates)
         return self.model({name: values[:, k] for k, name in enumerate(self.names)})
 
 
@@ -125,32 +507,6 @@ def _differentiated(
 _predicted = eqx.filter_jit(Problem.predict)
 
 
-def predictions_and_slopes(
-    problem: Problem, coordinates: Rows, mask: Bool[np.ndarray, " rows"] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions and their slopes, for every row of coordinates.
-
-    **Arguments:** `coordinates`: (rows, unknowns); `mask`: (rows,), which of the rows that are needed, by default
-    all.
-
-    **Returns:** (rows, n) and (rows, n, unknowns); NaN and 0 for rows that are not needed.
-    """
-    points = np.asarray(coordinates, float)
-    points = points if mask is None else np.where(mask[:, None], points, np.nan)
-    if problem.step is None:
-        prediction, slopes = _in_parts(lambda part: _differentiated(problem, part), points, ROWS_WITH_SLOPES)
-    else:
-        rows, unknowns = points.shape
-        offsets = problem.step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
-        moved = predictions(problem, (points[:, None] + offsets).reshape(-1, unknowns))
-        values, above, below = np.split(moved.reshape(rows, len(offsets), -1), [1, 1 + unknowns], axis=1)
-        with np.errstate(invalid="ignore"):
-            slopes = np.moveaxis(above - below, 1, -1) / (2.0 * problem.step)
-        # If a side has no prediction, the slope is 0.
-        prediction, slopes = values[:, 0], np.where(np.isfinite(slopes), slopes, 0.0)
-    return prediction, np.where(problem.acts, slopes, 0.0)
-
-
 def predictions(problem: Problem, coordinates: Rows) -> np.ndarray:
     """Predictions without slopes, for every row of coordinates; rows of NaN take no time."""
     predict, rows = Problem.predict if problem.on_host else _predicted, ROWS_OF_CALL
@@ -178,42 +534,53 @@ def _in_parts(
         return tuple(np.concatenate(result)[: len(coordinates)] for result in results)
 
 
-def linearise(
-    problem: Problem, coordinates: Rows, measurements: Measurements, mask: Bool[np.ndarray, " rows"] | None = None
-) -> Linearised:
+def linearise(density: "LogDensity", coordinates: Rows, mask: Bool[np.ndarray, " rows"] | None = None) -> Linearised:
     """Predictions, residuals and their slopes.
 
     **Arguments:**
 
-    - `problem`: the `Problem`.
-    - `coordinates`: (rows, unknowns); `mask`: as for `predictions_and_slopes`.
-    - `measurements`: `Measurements` of shape (n,) or (rows, n).
+    - `density`: its measurements may have the shape (n,) or (rows, n).
+    - `coordinates`: (rows, unknowns).
+    - `mask`: (rows,), which of the rows that are needed, by default all; predictions of the others are NaN, their slopes 0.
 
     **Returns:** a `Linearised`.
     """
-    return weighed(problem, coordinates, *predictions_and_slopes(problem, coordinates, mask), measurements)
+    problem = density.problem
+    points = np.asarray(coordinates, float)
+    points = points if mask is None else np.where(mask[:, None], points, np.nan)
+    if problem.step is None:
+        prediction, slopes = _in_parts(lambda part: _differentiated(problem, part), points, ROWS_WITH_SLOPES)
+    else:
+        rows, unknowns = points.shape
+        offsets = problem.step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
+        moved = predictions(problem, (points[:, None] + offsets).reshape(-1, unknowns))
+        values, above, below = np.split(moved.reshape(rows, len(offsets), -1), [1, 1 + unknowns], axis=1)
+        with np.errstate(invalid="ignore"):
+            slopes = np.moveaxis(above - below, 1, -1) / (2.0 * problem.step)
+        # If a side has no prediction, the slope is 0.
+        prediction, slopes = values[:, 0], np.where(np.isfinite(slopes), slopes, 0.0)
+    return weighed(density, coordinates, prediction, np.where(problem.acts, slopes, 0.0))
 
 
 def weighed(
-    problem: Problem,
+    density: "LogDensity",
     coordinates: Rows,
     prediction: Float[np.ndarray, "rows n"],
     slopes: Float[np.ndarray, "rows n unknowns"],
-    measurements: Measurements,
 ) -> Linearised:
     """Predictions and slopes, compared with measurements and priors; without a run."""
-    residual, by_prediction, root = compared(measurements, prediction)
-    prior, by_coordinate = map(np.asarray, _priors(problem.unknowns, jnp.asarray(coordinates, float)))
+    residual, by_prediction, root = compared(density.measurements, prediction)
+    prior, by_coordinate = map(np.asarray, density.problem.unknowns.prior_residuals(jnp.asarray(coordinates, float)))
     of_all = (np.concatenate([factor[..., None] * slopes, by_coordinate], axis=1) for factor in (by_prediction, root))
     return Linearised(prediction, slopes, np.concatenate([residual, prior], axis=1), *of_all)
 
 
 def deviances(
-    problem: Problem, coordinates: Rows, prediction: Float[np.ndarray, "rows n"], measurements: Measurements
+    density: "LogDensity", coordinates: Rows, prediction: Float[np.ndarray, "rows n"]
 ) -> Float[np.ndarray, " rows"]:
     """-2 log posterior in every row, up to a constant, from the predictions of the rows."""
-    residual = compared(measurements, prediction)[0]
-    prior = np.asarray(_priors(problem.unknowns, jnp.asarray(coordinates, float))[0])
+    residual = compared(density.measurements, prediction)[0]
+    prior = np.asarray(density.problem.unknowns.prior_residuals(jnp.asarray(coordinates, float))[0])
     return np.sum(residual**2, axis=1) + np.sum(prior**2, axis=1)
 
 
@@ -239,24 +606,7 @@ def _residuals(measurements: Measurements, prediction: Float[Array, " n"]) -> tu
     return residual, slope, measurements.roots_of_information(prediction, slope)
 
 
-@eqx.filter_jit
-def _priors(unknowns: tuple[Unknown, ...], coordinates: Float[Array, "rows unknowns"]) -> tuple[Array, Array]:
-    """Residuals of the priors, and their slopes with respect to the coordinates."""
-
-    def of(row: Float[Array, " unknowns"]) -> Float[Array, " priors"]:
-        priors = [
-            (unknown.value(row[k]), *unknown.prior) for k, unknown in enumerate(unknowns) if unknown.prior is not None
-        ]
-        return jnp.array([(value - mean) / deviation for value, mean, deviation in priors])
-
-    return jax.vmap(of)(coordinates), jax.vmap(jax.jacfwd(of))(coordinates)
-
-
 # The posterior of parameters, as a function of unbounded coordinates for any sampler.
-
-#: The log density of a parameter: (mean, standard deviation) of a Gaussian, only the standard deviation, or a function of the
-#: parameter.
-Prior = tuple[float, float] | float | Callable[[Float[Array, ""]], Float[Array, ""]]
 
 
 class LogDensity(eqx.Module):
@@ -279,7 +629,6 @@ class LogDensity(eqx.Module):
 
     problem: Problem
     measurements: Measurements
-    priors: dict[str, Any]
     open_series: tuple[int, ...] = eqx.field(static=True)
     series_units: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -302,24 +651,23 @@ class LogDensity(eqx.Module):
         `series_units`: the unit of each series of the measurements, if known.
         """
         unknowns = as_free(free)
-        of_unknowns = {name: unknown.prior for name, unknown in unknowns.items() if unknown.prior is not None}
-        leaves: dict[str, Any] = {}
-        for name, prior in (of_unknowns | dict(priors or {})).items():
+        checked: dict[str, Any] = {}
+        for name, prior in (priors or {}).items():
             if name not in unknowns:
                 raise ValueError(f"priors: {name!r} must be one of {', '.join(unknowns)}")
             # Numbers become arguments of compiled programs; a function becomes part of them.
             if not callable(prior):
-                leaves[name] = np.asarray(as_gaussian(prior, unknowns[name].start, name), float)
+                checked[name] = as_gaussian(prior, unknowns[name].start, name)
             else:
-                leaves[name] = prior if isinstance(prior, eqx.Module) else jax.tree_util.Partial(prior)
+                checked[name] = prior if isinstance(prior, eqx.Module) else jax.tree_util.Partial(prior)
         series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)
         recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
         steps = {"exact": None, "differences": OF_RECORDING if recorded else DIFFERENCE}
         if not isinstance(slopes, str) or slopes not in steps:
             raise ValueError(f"slopes = {shown(slopes)} must be one of {', '.join(map(repr, steps))}")
-        problem = Problem(model, unknowns, steps[slopes])
+        problem = Problem(model, unknowns, steps[slopes], checked)
         open_series = tuple(np.unique(series[estimated]).tolist())
-        return cls(problem, measurements, leaves, open_series, series_units)
+        return cls(problem, measurements, open_series, series_units)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -335,8 +683,8 @@ class LogDensity(eqx.Module):
     @property
     def start(self) -> Float[Array, " unknowns"]:
         """The coordinates of the start."""
-        values = [float(unknown.coordinate(unknown.start)) for unknown in self.problem.unknowns]
-        return jnp.array([*values, *(0.0 for _ in self.open_series)])
+        unknowns = self.problem.unknowns
+        return jnp.append(unknowns.coordinates(np.asarray(unknowns.start)), jnp.zeros(len(self.open_series)))
 
     def values(self, coordinates: Float[Array | np.ndarray, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
         """The unknowns at given coordinates: name -> (...,).
@@ -355,41 +703,31 @@ class LogDensity(eqx.Module):
                 f"coordinates of shape {coordinates.shape} must have {len(self.names)} numbers along the last axis: "
                 f"{', '.join(self.names)}"
             )
-        unknowns = self.problem.values(coordinates[..., :numbers])
+        unknowns = self.problem.unknowns.values(coordinates[..., :numbers])
         # The first guesses of the unknown errors, one for each series.
         mask = [self.measurements.estimated & (self.measurements.series == k) for k in self.open_series]
         guesses = jnp.array([self.measurements.error[jnp.argmax(series)] for series in mask])
         errors = guesses * jnp.exp(coordinates[..., numbers:])
         return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([unknowns, errors], axis=-1), -1, 0), strict=True))
 
-    def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
-        """The model's predictions for all measurements, at several sets of coordinates."""
-        if self.problem.on_host and not is_traced(coordinates):
-            # By the program of a fit, for whatever number of rows.
-            return jnp.asarray(self.predictions(np.asarray(coordinates)))
-        return self.problem.predict(coordinates[:, : len(self.problem.names)])
-
-    def predictions(self, coordinates: Rows) -> Float[np.ndarray, "rows n"]:
-        """The predictions of the model as NumPy arrays, also of a model that cannot be traced; NaN for NaN.
+    def predict(self, coordinates: Float[Array | np.ndarray, "rows unknowns"]) -> Any:
+        """The model's predictions for all measurements, (rows, n), at several sets of coordinates; NumPy arrays outside of
+        transformations, also of a model that cannot be traced, and NaN for NaN.
 
         **Raises:** `ValueError` if the model does not return one prediction per measurement.
         """
-        prediction = predictions(self.problem, coordinates[:, : len(self.problem.names)])
-        shape = (len(coordinates), self.measurements.value.size)
+        own = coordinates[:, : len(self.problem.names)]
+        if is_traced((own, self)):
+            return self.problem.predict(jnp.asarray(own))
+        prediction, shape = predictions(self.problem, np.asarray(own)), (len(own), self.measurements.value.size)
         if prediction.shape != shape:
             raise ValueError(f"model must predict {shape} for {shape[0]} sets, not {prediction.shape}")
         return prediction
 
-    def log_priors(self, coordinates: Rows) -> Float[np.ndarray, " rows"]:
-        """The log density of the priors in the coordinates, in every row."""
-        # In the order of the coordinates; JAX would sort a dictionary by its keys.
-        priors = tuple(map(self.priors.get, self.problem.names))
-        return np.asarray(_log_priors(self.problem.unknowns, priors, coordinates))
-
     @status_line("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
         """New measurements drawn from the predictions and their errors; limits are replaced by values."""
-        random, predicted = np.random.default_rng(seed), self.predictions(np.asarray(coordinates))
+        random, predicted = np.random.default_rng(seed), np.asarray(self.predict(coordinates))
         heavy = np.isfinite(freedom := np.asarray(self.measurements.student))
         noise = random.normal(size=predicted.shape)
         noise /= np.where(
@@ -404,8 +742,7 @@ class LogDensity(eqx.Module):
 
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
         """The log density at given coordinates, for given predictions of the model."""
-        priors = tuple(map(self.priors.get, self.problem.names))
-        log_prior = _log_prior(self.problem.unknowns, priors, coordinates)
+        log_prior = self.problem.unknowns.log_prior(coordinates)
         return self._with_errors(coordinates).log_likelihood(prediction) + log_prior
 
     @status_line("simulating")
@@ -415,37 +752,16 @@ class LogDensity(eqx.Module):
         """The log density and its gradient, at one point or at a list of them."""
         return _value_and_gradient(self, jnp.asarray(coordinates, float))
 
+    def with_errors(self, errors: Float[Array | np.ndarray, " n"]) -> "LogDensity":
+        """The density for measurements with other errors."""
+        return eqx.tree_at(lambda density: density.measurements, self, self.measurements.with_errors(errors))
+
     def _with_errors(self, coordinates: Float[Array, " unknowns"]) -> Measurements:
         errors = self.measurements.error
         for coordinate, series in zip(coordinates[len(self.problem.names) :], self.open_series, strict=True):
             mask = self.measurements.estimated & (self.measurements.series == series)
             errors = jnp.where(mask, errors * jnp.exp(coordinate), errors)
         return self.measurements.with_errors(errors)
-
-
-def _log_prior(
-    unknowns: tuple[Unknown, ...], priors: tuple[Any, ...], coordinates: Float[Array, " unknowns"]
-) -> Float[Array, ""]:
-    """The log density of the priors in the coordinates: the density of each parameter, and the Jacobian of its
-    coordinate. The coordinates of unknown errors, which come last, have a flat prior."""
-    total = jnp.zeros(())
-    for unknown, prior, coordinate in zip(unknowns, priors, coordinates[: len(unknowns)], strict=True):
-        if prior is not None:
-            value, slope = jax.value_and_grad(unknown.value)(coordinate)
-            if callable(prior):
-                log_density: Any = prior(value)
-            else:
-                mean, deviation = prior
-                log_density = -0.5 * ((value - mean) / deviation) ** 2 - jnp.log(deviation * math.sqrt(2.0 * math.pi))
-            total += log_density + jnp.log(jnp.abs(slope))
-        elif unknown.has_lower and unknown.has_upper:
-            # Uniform between two bounds; in the coordinate, the prior would have no finite integral.
-            total += jnp.log(jnp.abs(jax.grad(unknown.value)(coordinate)))
-    return total
-
-
-# Without the data, so that one program serves all fits of the same unknowns.
-_log_priors = eqx.filter_jit(eqx.filter_vmap(_log_prior, in_axes=(None, None, 0)))
 
 
 @eqx.filter_jit

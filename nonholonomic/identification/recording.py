@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..text import SYNONYMS, UNITS, counted, likely, one_line, readable_unit, shown
 from ..validation import as_number, as_path, require, warn
-from .likelihood import Measurements
+from .posterior import Measurements
 
 # Only for type checkers: models stand above fits.
 if TYPE_CHECKING:
@@ -114,6 +114,12 @@ class AbstractData(eqx.Module):
     def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
         """Labels for a picture, with numbers in other units if they have any."""
         return self.labels
+
+
+def numbered(labels: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """The labels of all sets of data, with the number of the set if there are several."""
+    several = len(labels) > 1
+    return tuple(f"{k}: {label}" if several else label for k, part in enumerate(labels, 1) for label in part)
 
 
 #: Samples of a top or a stroller are usually closer together [s]; others may have times in milliseconds.

@@ -24,9 +24,8 @@ from ..validation import require, require_flag, require_package, require_scalars
 from ..views import draw_fit
 from .conclusions import Distribution, Profile, Verdict, judge, profiled, sentences
 from .exploration import ROWS, Explorer, Mixture, Pool, draw_errors
-from .likelihood import Free, Measurements, joined_data, numbered
-from .posterior import LogDensity, Model, Problem, predictions
-from .recording import AbstractRecording
+from .posterior import Free, LogDensity, Measurements, Model, predictions
+from .recording import AbstractRecording, numbered
 from .search import FitWarning, Identifiability, Minima, identifiability, search
 
 # The result of a fit: estimates, errors, undetermined combinations, and the outcome of every start.
@@ -90,6 +89,7 @@ class Identification:
     - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
     - `distribution`: the `Distribution` of the coordinates, with its weighted points.
+    - `density`: the `LogDensity` of model and measurements.
     - `series_units`: the unit of each series of the measurements, if known; `units`: name -> unit of a parameter, if known.
     - `profiles`: index of a parameter -> its profile, once it has been computed.
 
@@ -117,9 +117,7 @@ class Identification:
     coordinates: Float[np.ndarray, " unknowns"]
     coordinate_covariance: Float[np.ndarray, "unknowns unknowns"]
     distribution: Distribution = dataclasses.field(repr=False)
-    problem: Problem = dataclasses.field(repr=False)
-    measurements: Measurements = dataclasses.field(repr=False)
-    series_units: tuple[str, ...] = ()
+    density: LogDensity = dataclasses.field(repr=False)
     units: dict[str, str] = dataclasses.field(default_factory=dict)
     profiles: dict[int, Profile] = dataclasses.field(default_factory=dict, repr=False)
 
@@ -135,9 +133,10 @@ class Identification:
         **Raises:** `ValueError` for a name that was not free.
         """
         k = self._place(name)
-        with np.errstate(over="ignore"):
-            ends = self.problem.unknowns[k].value(np.array(self.distribution.interval(k, deviations)))
-        return float(ends[0]), float(ends[1])
+        ends = np.tile(self.coordinates, (2, 1))
+        ends[:, k] = self.distribution.interval(k, deviations)
+        low, high = self.density.problem.unknowns.values(ends)[:, k].tolist()
+        return low, high
 
     @status_line("fitting again")
     def profile(self, name: str, values: ArrayLike | None = None) -> Profile:
@@ -159,17 +158,16 @@ class Identification:
         k = self._place(name)
         if values is None and k in self.profiles:
             return self.profiles[k]
-        free, error = self.problem.unknowns[k], self.standard_errors[self.problem.names[k]]
+        lower, upper = self.density.problem.unknowns.lower[k], self.density.problem.unknowns.upper[k]
+        error = self.standard_errors[self.density.problem.names[k]]
         if values is None and not np.isfinite(error):
             word = "infinite" if np.isinf(error) else "unknown"
             raise ValueError(f"values must be given for {name!r}, whose standard error is {word}")
         held = (
             np.linspace(*self.interval(name, 3.0), 13) if values is None else np.atleast_1d(np.asarray(values, float))
         )
-        if not np.all((held > free.lower) & (held < free.upper)):
-            raise ValueError(
-                f"values = {shown(held)} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}"
-            )
+        if not np.all((held > lower) & (held < upper)):
+            raise ValueError(f"values = {shown(held)} must lie within the bounds ({lower}, {upper}) of {name!r}")
         profile = profiled(self, k, held)
         if concern := profile.concern(name):
             warn(concern, FitWarning)
@@ -185,30 +183,34 @@ class Identification:
         Every slice has as many samples as the recordings, at times that are shifted by a fraction of the distance to the next
         sample, so that the program of the fit predicts them.
         """
-        problem, data = self.problem, getattr(self.problem.model, "recorded", ())
-        sizes = [len(source.times) for source in data if isinstance(source, AbstractRecording)]
-        if not sizes:
+        problem = self.density.problem
+        data = getattr(problem.model, "recorded", ())
+        recordings = [source for source in data if isinstance(source, AbstractRecording)]
+        if not recordings:
             return np.zeros((0, 0)), np.zeros((0, 0))
-        pairs = zip(problem.unknowns, self.most_likely.values(), strict=True)
-        coordinates = np.array([float(unknown.coordinate(value)) for unknown, value in pairs])
-        count = int(np.clip(np.ceil(POINTS / max(sizes)), 1, MOST))
+        coordinates = problem.unknowns.coordinates(np.array(list(self.most_likely.values())))
+        count = int(np.clip(np.ceil(POINTS / max(len(source.times) for source in recordings)), 1, MOST))
         slices = []
         for share in np.arange(count) / count:
-            shifted, offsets = [], []
-            for source in data:
-                offsets.append(np.zeros(len(source.seen)))
-                if isinstance(source, AbstractRecording):
-                    times = np.asarray(source.times)
-                    last = times[-1] + share * 1e-6 * (times[-1] - times[0])
-                    moved = np.append(times[:-1] + share * np.diff(times), last)
-                    offsets[-1] += moved[0] - times[0]
-                    source = dataclasses.replace(source, times=moved)
-                shifted.append(source)
-            there = eqx.tree_at(lambda problem: problem.model, problem, problem.model.with_recorded(tuple(shifted)))
-            times = np.asarray(joined_data(shifted)[0].time) + np.concatenate(offsets)
-            slices.append((times, predictions(there, coordinates[None])[0]))
+
+            def moved(source: AbstractRecording, share: float = share) -> dict[str, np.ndarray]:
+                times = np.asarray(source.times)
+                last = times[-1] + share * 1e-6 * (times[-1] - times[0])
+                return {"times": np.append(times[:-1] + share * np.diff(times), last)}
+
+            there = eqx.tree_at(lambda problem: problem.model, problem, problem.model.with_times(moved))
+            times = []
+            for source, original in zip(there.model.recorded, data, strict=True):
+                offset = source.times[0] - original.times[0] if isinstance(source, AbstractRecording) else 0.0
+                times.append(np.asarray(source.measurements.time + offset))
+            slices.append((np.concatenate(times), predictions(there, coordinates[None])[0]))
         times, values = zip(*slices, strict=True)
         return np.stack(times), np.stack(values)
+
+    @property
+    def series_units(self) -> tuple[str, ...]:
+        """The unit of each series of the measurements, if known."""
+        return self.density.series_units
 
     @property
     def correlation(self) -> Float[np.ndarray, "unknowns unknowns"]:
@@ -231,7 +233,7 @@ class Identification:
         """
         require_package("matplotlib", "plot", "plot")
         require_unit(unit)
-        sources = getattr(self.problem.model, "recorded", ())
+        sources = getattr(self.density.problem.model, "recorded", ())
         labels = [source.labels_in(unit) for source in sources] or [[row.label for row in self.residuals]]
         return draw_fit(self, numbered(labels), unit)
 
@@ -277,18 +279,17 @@ class Identification:
 
 def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample: Pool) -> Identification:
     """The result of a search and an exploration: the best fit, errors and intervals, and a record of all ends."""
-    problem, best, measurements, count = explorer.density.problem, ends.best, ends.measurements, len(labels)
+    problem, best, measurements, count = ends.density.problem, ends.best, ends.density.measurements, len(labels)
     deviances, linearised, optimum = ends.deviance, ends.linearised, ends.coordinates[ends.best]
     statuses = tuple(
         "failed" if np.isinf(deviance) else "converged" if has_converged else "not_converged"
         for deviance, has_converged in zip(deviances, ends.converged, strict=True)
     )
     # The slopes of the parameters with respect to their coordinates.
-    pairs = zip(problem.unknowns, optimum, strict=True)
-    slopes = np.array([float(jax.grad(unknown.value)(coordinate)) for unknown, coordinate in pairs])
+    slopes = np.asarray(jax.jvp(problem.unknowns.values, (optimum,), (np.ones_like(optimum),))[1])
     by_slopes = ends.covariance(best)
     distribution = Distribution.of(optimum, by_slopes, sample)
-    likely, covariance = problem.values(optimum), distribution.covariance_of_values(problem, slopes)
+    likely, covariance = problem.unknowns.values(optimum), distribution.covariance_of_values(problem, slopes)
     numbers = (measurements.value, measurements.error, linearised.prediction[best], linearised.residual[best, :count])
     table = zip(labels, *(np.asarray(part).tolist() for part in (*numbers, measurements.upper)), strict=True)
     combinations = identifiability(problem, likely, slopes, linearised.information[best, :count])
@@ -301,7 +302,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         return ByName(zip(problem.names, numbers, strict=True))
 
     return Identification(
-        estimates=by_name(problem.values(distribution.estimate).tolist()),
+        estimates=by_name(problem.unknowns.values(distribution.estimate).tolist()),
         standard_errors=by_name(np.sqrt(np.diag(covariance)).tolist()),
         covariance=covariance,
         most_likely=by_name(likely.tolist()),
@@ -311,16 +312,15 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         identifiability=combinations,
         residuals=tuple(ResidualRow(*row) for row in table),
         status=status,
-        starts=by_name(problem.values(ends.starts).T),
-        ends=by_name(problem.values(ends.coordinates).T),
+        starts=by_name(problem.unknowns.values(ends.starts).T),
+        ends=by_name(problem.unknowns.values(ends.coordinates).T),
         end_deviances=deviances,
         statuses=statuses,
         verdict=judge(ends, explorer, sample, distribution, combinations.unseen, status),
         coordinates=distribution.estimate,
         coordinate_covariance=distribution.covariance,
         distribution=distribution,
-        problem=problem,
-        measurements=measurements,
+        density=ends.density,
     )
 
 
@@ -391,9 +391,15 @@ def identify(
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
     with status_line("fitting", progress):
         density = LogDensity.of(model, measurements, free, slopes=slopes)
-        explorer = Explorer.of(density, spread, seed)
-        explorer, minima, sample = search(explorer, starts, max_steps, seed, progress)
-        result = summarise(labels, minima, explorer, sample)
+        return most_likely(density, labels, starts, spread, seed, max_steps, progress)
+
+
+def most_likely(
+    density: LogDensity, labels: tuple[str, ...], starts: int, spread: float, seed: int, max_steps: int, progress: bool
+) -> Identification:
+    """The parameters of greatest density. **Arguments:** as for `identify`, checked."""
+    explorer, minima, sample = search(Explorer.of(density, spread, seed), starts, max_steps, progress)
+    result = summarise(labels, minima, explorer, sample)
     if not result.verdict.good:
         warn("; ".join(result.verdict.concerns), FitWarning)
     return result
@@ -584,7 +590,7 @@ def drawn(
     """
     chains, discarded, draws = sizes
     explorer, random = Explorer.of(density, SPREAD, seed), np.random.default_rng(seed)
-    explorer, minima, explored = search(explorer, STARTS, STEPS, seed, progress)
+    explorer, minima, explored = search(explorer, STARTS, STEPS, progress)
     components = minima.components
     if known is not None:
         components = known if components is None else components.joined(known, 0.5)

@@ -8,7 +8,6 @@ Source: Madsen, Nielsen and Tingleff, "Methods for non-linear least squares prob
 scaling is More's (Lecture Notes in Mathematics 630 (1978) 105).
 """
 
-import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -21,8 +20,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 from ..terminal import Progress
 from ..validation import warn
 from .exploration import FALL, Explorer, Mixture, Pool
-from .likelihood import DOWN_WEIGHTED, Measurements, estimated_errors
-from .posterior import Linearised, Problem, deviances, linearise, predictions, predictions_and_slopes, weighed
+from .posterior import Linearised, LogDensity, Problem, deviances, estimated_errors, linearise, predictions, weighed
 from .recording import AbstractRecording
 
 #: Damping of the first step, as a fraction of the squared slope with respect to each coordinate.
@@ -53,9 +51,8 @@ ROUND_OFF = 1e-7
 
 
 def minimise(
-    problem: Problem,
+    density: LogDensity,
     starts: Float[np.ndarray, "rows unknowns"],
-    measurements: Measurements,
     *,
     fixed: int | None = None,
     max_steps: int = 60,
@@ -65,9 +62,8 @@ def minimise(
 
     **Arguments:**
 
-    - `problem`: the `Problem`.
+    - `density`: its measurements are of shape (n,), the same for all rows, or (rows, n).
     - `starts`: coordinates, (rows, unknowns).
-    - `measurements`: (n,), the same for all rows, or (rows, n).
     - `fixed`: index of an unknown that keeps its start value, or `None`.
     - `max_steps`: a row that needs more steps has not converged.
     - `progress`: whether to show, on a terminal or in a notebook, how many rows are done.
@@ -77,13 +73,12 @@ def minimise(
     starts = np.asarray(starts, float)
     coordinates = starts.copy()
     count, unknowns = coordinates.shape
-    # By NumPy: JAX would compile a program for every number of rows.
-    of_rows = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (count, leaf.shape[-1])), measurements)
     moving = np.array([k for k in range(unknowns) if k != fixed], int)
-    bounded = [unknown.has_lower or unknown.has_upper for unknown in problem.unknowns]
-    reach = np.where(bounded, FARTHEST, np.inf)[moving]
+    of_unknowns = density.problem.unknowns
+    is_bounded = np.isfinite(of_unknowns.lower) | np.isfinite(of_unknowns.upper)
+    reach = np.where(is_bounded, FARTHEST, np.inf)[moving]
     with Progress(count, "fit", shown=progress) as display:
-        current = linearise(problem, coordinates, of_rows)
+        current = linearise(density, coordinates)
         display.begin()
         scale, damping = np.zeros((count, len(moving))), np.full(count, FIRST_DAMPING)
         free = max(current.residual.shape[1] - len(moving), 1)
@@ -103,7 +98,7 @@ def minimise(
             predicted_gain = -np.einsum("ri,rij,rj->r", move, squares, move) - 2.0 * np.sum(move * slope, axis=1)
             trial_coordinates = coordinates.copy()
             trial_coordinates[:, moving] += move
-            trial = linearise(problem, trial_coordinates, of_rows, ~converged)
+            trial = linearise(density, trial_coordinates, ~converged)
             gain = current.deviance - trial.deviance
             improves = ~converged & (gain > 0.0)
             damping = np.where(improves, np.where(gain > GOOD * predicted_gain, EASED, 1.0), HARDENED) * damping
@@ -116,7 +111,7 @@ def minimise(
                 ended |= history[-1 - PATIENCE] - current.deviance < STALLED * excess
             display.advance(int(np.sum(ended & ~converged)), steps=step)
             converged |= ended
-    return Minima(starts, coordinates, converged, current, measurements)
+    return Minima(starts, coordinates, converged, current, density)
 
 
 def chosen(improves: Bool[np.ndarray, " rows"], new: PyTree, old: PyTree) -> PyTree:
@@ -205,8 +200,7 @@ def identifiability(
     `jacobian`: (n, unknowns), of the residuals with respect to the coordinates.
     """
     # Changes of a parameter that cannot be negative are relative, in per cent; others in hundredths of its unit.
-    positive = [bool(unknown.lower >= 0.0) for unknown in problem.unknowns]
-    units = np.array([float(unknown.unit) for unknown in problem.unknowns])
+    positive, units = np.asarray(problem.unknowns.lower >= 0.0), np.asarray(problem.unknowns.unit)
     values, directions = _singular(
         jacobian * np.where(positive, np.abs(estimates), units) / np.where(slopes == 0.0, 1.0, slopes)
     )
@@ -227,8 +221,8 @@ def identifiability(
 #: Unknown errors and parameters are estimated in turns, until no error changes by more than this fraction.
 ROUNDS, SETTLED = 10, 0.01
 
-#: The fractions of a recording that are fitted before the whole.
-PARTS = (0.1, 0.25, 0.5)
+#: The fractions of a recording that are fitted before the whole, and the factor on the errors of later measurements.
+PARTS, DOWN_WEIGHTED = (0.1, 0.25, 0.5), 1e6
 
 #: The greatest numbers of steps in the fit of a recording: for each part, for the whole at once, and between its minima.
 OF_PART, AT_ONCE, BETWEEN = 8, 15, 20
@@ -249,14 +243,14 @@ class Minima(NamedTuple):
     """The ends of least-squares fits, a row each.
 
     - `starts`, `coordinates`: (rows, unknowns), where each began and ended; `converged`: (rows,).
-    - `linearised`: model and likelihood at the ends; `measurements`: with the errors that were estimated at the best end.
+    - `linearised`: model and likelihood at the ends; `density`: with the errors that were estimated at the best end.
     """
 
     starts: Float[np.ndarray, "rows unknowns"]
     coordinates: Float[np.ndarray, "rows unknowns"]
     converged: Bool[np.ndarray, " rows"]
     linearised: Linearised
-    measurements: Measurements
+    density: LogDensity
 
     @property
     def deviance(self) -> Float[np.ndarray, " rows"]:
@@ -281,18 +275,18 @@ class Minima(NamedTuple):
         is_close = np.all(np.where(np.isfinite(errors), distances, 0.0) < CLOSE, axis=1)
         return int(np.sum((is_close | (excess < SAME)) & (excess < 1.0)))
 
-    def joined(self, problem: Problem, other: "Minima") -> "Minima":
+    def joined(self, other: "Minima") -> "Minima":
         """The best of the ends of two searches, as many as this one has.
 
         Each search has estimated unknown errors for itself, and -2 log likelihoods with different errors cannot be compared:
         both are compared with the errors of the search that is the better one with the errors of this one.
         """
-        is_better = np.min(other.weighed(problem, self.measurements).deviance) < np.min(self.deviance)
-        measurements = other.measurements if is_better else self.measurements
-        pair = self.weighed(problem, measurements), other.weighed(problem, measurements)
+        is_better = np.min(other.weighed(self.density).deviance) < np.min(self.deviance)
+        density = other.density if is_better else self.density
+        pair = self.weighed(density), other.weighed(density)
         order = np.argsort(np.concatenate([minima.deviance for minima in pair]), kind="stable")[: len(self.starts)]
         ends = jax.tree.map(lambda *parts: np.concatenate(parts)[order], *(minima[:4] for minima in pair))
-        return Minima._make((*ends, measurements))
+        return Minima._make((*ends, density))
 
     def between(self) -> Float[np.ndarray, "rows unknowns"]:
         """Points between the best end and the others, and beyond it, the nearest first.
@@ -313,13 +307,12 @@ class Minima(NamedTuple):
         """The covariance of the coordinates by the slopes at an end."""
         return coordinate_covariance(self.linearised.information[row])
 
-    def weighed(self, problem: Problem, measurements: Measurements) -> "Minima":
+    def weighed(self, density: LogDensity) -> "Minima":
         """The same ends, compared with measurements of other errors."""
-        if measurements is self.measurements:
+        if density is self.density:
             return self
-        at_ends = self.linearised
-        at_ends = weighed(problem, self.coordinates, at_ends.prediction, at_ends.slopes, measurements)
-        return self._replace(linearised=at_ends, measurements=measurements)
+        at_ends = weighed(density, self.coordinates, self.linearised.prediction, self.linearised.slopes)
+        return self._replace(linearised=at_ends, density=density)
 
     @property
     def components(self) -> Mixture | None:
@@ -343,9 +336,8 @@ class Minima(NamedTuple):
 
 
 def refine(
-    problem: Problem,
+    density: LogDensity,
     starts: Float[np.ndarray, "rows unknowns"],
-    measurements: Measurements,
     max_steps: int,
     progress: bool,
     in_parts: bool = False,
@@ -355,31 +347,31 @@ def refine(
     **Arguments:** `in_parts`: whether recordings are also fitted in stages, of which the better of the two ends counts;
     predicted late samples can be wrong by whole turns, and would then lead to another minimum; the others as for `minimise`.
     """
+    measurements = density.measurements
     if in_parts:
         duration = float(np.max(np.asarray(measurements.time)))
         steps, coordinates = min(max_steps, AT_ONCE), starts
-        minima = minimise(problem, starts, measurements, max_steps=steps, progress=progress)
+        minima = minimise(density, starts, max_steps=steps, progress=progress)
         for part in PARTS:
             # Later measurements have nearly no weight.
             factor = jnp.where(measurements.time > part * duration, DOWN_WEIGHTED, 1.0)
-            early = measurements.with_errors(measurements.error * factor)
-            few = min(max_steps, OF_PART)
-            coordinates = minimise(problem, coordinates, early, max_steps=few, progress=progress).coordinates
-        by_parts = minimise(problem, coordinates, measurements, max_steps=2 * steps, progress=progress)
+            early = density.with_errors(measurements.error * factor)
+            coordinates = minimise(early, coordinates, max_steps=min(max_steps, OF_PART), progress=progress).coordinates
+        by_parts = minimise(density, coordinates, max_steps=2 * steps, progress=progress)
         improves = by_parts.linearised.deviance < minima.linearised.deviance
         coordinates, converged, linearised = chosen(improves, by_parts[1:4], minima[1:4])
-        minima = Minima(minima.starts, coordinates, converged, linearised, measurements)
+        minima = Minima(minima.starts, coordinates, converged, linearised, density)
     else:
-        minima = minimise(problem, starts, measurements, max_steps=max_steps, progress=progress)
+        minima = minimise(density, starts, max_steps=max_steps, progress=progress)
     for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
         best = minima.linearised.prediction[np.argmin(minima.linearised.deviance)]
-        errors = estimated_errors(measurements, best, len(problem.names))
-        change = np.max(np.abs(np.log(errors / np.asarray(measurements.error))))
-        measurements = measurements.with_errors(errors)
+        errors = estimated_errors(density.measurements, best, starts.shape[1])
+        change = np.max(np.abs(np.log(errors / np.asarray(density.measurements.error))))
+        density = density.with_errors(errors)
         if change <= SETTLED:
-            minima = minima.weighed(problem, measurements)
+            minima = minima.weighed(density)
             break
-        minima = minimise(problem, minima.coordinates, measurements, max_steps=max_steps, progress=progress)
+        minima = minimise(density, minima.coordinates, max_steps=max_steps, progress=progress)
     return minima._replace(starts=np.asarray(starts))
 
 
@@ -415,7 +407,7 @@ LAST = 4
 IMPROVED = 0.1
 
 
-def search(explorer: Explorer, starts: int, max_steps: int, seed: int, progress: bool) -> tuple[Explorer, Minima, Pool]:
+def search(explorer: Explorer, starts: int, max_steps: int, progress: bool) -> tuple[Explorer, Minima, Pool]:
     """Compare candidates, refine the best, and explore the likelihood around all minima; or explore first, where steps by
     differences cost more. **Arguments:** as for `identify`.
 
@@ -427,11 +419,11 @@ def search(explorer: Explorer, starts: int, max_steps: int, seed: int, progress:
     with ThreadPoolExecutor(1) as thread:
         if problem.step is None:
             # Compile the slopes while this thread compiles and computes the predictions.
-            thread.submit(predictions_and_slopes, problem, np.full((1, len(problem.names)), np.nan))
+            thread.submit(linearise, explorer.density, np.full((1, len(problem.names)), np.nan))
         # A call on the host takes as long for a single candidate as for all.
-        pool = explorer.begin(seed) if problem.on_host else None
+        pool = explorer.begin() if problem.on_host else None
         _refuse_milliseconds(explorer, pool)
-        pool = explorer.begin(seed) if pool is None else pool
+        pool = explorer.begin() if pool is None else pool
     if not np.any(np.isfinite(pool.predictions)):
         raise ValueError(
             "no start led to finite predictions: simulate a run with the start values of `free` to see whether it fails; an "
@@ -443,8 +435,8 @@ def search(explorer: Explorer, starts: int, max_steps: int, seed: int, progress:
         warn(
             f"no prediction depends on {names}, so the data say nothing about it: fix it, or add other data", FitWarning
         )
-    problem = eqx.tree_at(lambda problem: problem.acts, problem, acts)
-    explorer = explorer._replace(density=eqx.tree_at(lambda density: density.problem, explorer.density, problem))
+    density = eqx.tree_at(lambda density: density.problem.acts, explorer.density, acts)
+    explorer = explorer._replace(density=density)
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
     # Whether there is a single unknown, and the density falls towards both ends of its range.
@@ -456,21 +448,20 @@ def search(explorer: Explorer, starts: int, max_steps: int, seed: int, progress:
         best = sample.points[sample.most_probable(min(starts, LAST if recorded else 1))]
         # Among so many points of a single unknown, the best is close to the minimum.
         steps = min(steps, 1) if sample.enough and not recorded else steps
-        return explorer, refine(problem, best, measurements, steps, progress), sample
+        return explorer, refine(density, best, steps, progress), sample
     # The first point; then, in turn, the best for all measurements and for the early ones.
     totals = np.cumsum(pool.groups, axis=1) + pool.log_prior[:, None]
     columns = sorted({totals.shape[1] - 1, *(totals.shape[1] * part // 8 for part in (0, 1, 2, 4))}, reverse=True)
     ranked = np.stack([np.argsort(-totals[:, column]) for column in columns], axis=1).reshape(-1)
     candidates = pool.points[list(dict.fromkeys([0, *ranked.tolist()]))[:starts]]
-    minima = refine(problem, candidates, measurements, steps, progress, in_parts=recorded)
+    minima = refine(density, candidates, steps, progress, in_parts=recorded)
     if recorded:
-        between = minima.between()
-        later = refine(problem, between, minima.measurements, min(max_steps, BETWEEN), progress)
-        minima = minima.joined(problem, later)
+        later = refine(minima.density, minima.between(), min(max_steps, BETWEEN), progress)
+        minima = minima.joined(later)
     # Along a direction without any slope, the likelihood has no end that an exploration could find.
     has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
     sample = explorer.explore(pool, minima.components, progress) if has_end else pool
-    return explorer, _improved(problem, minima, sample, max_steps, progress), sample
+    return explorer, _improved(minima, sample, max_steps, progress), sample
 
 
 def _refuse_milliseconds(explorer: Explorer, pool: Pool | None) -> None:
@@ -498,11 +489,7 @@ def _refuse_milliseconds(explorer: Explorer, pool: Pool | None) -> None:
     recordings = [source for source in data if isinstance(source, AbstractRecording)]
     if min((np.median(np.diff(source.times)) for source in recordings if len(source.times) > 2), default=0.0) < SPARSE:
         return
-    shorter = tuple(
-        dataclasses.replace(source, times=1e-3 * source.times, t0=1e-3 * source.t0) if is_recorded else source
-        for source, is_recorded in zip(data, recorded, strict=True)
-    )
-    model = problem.model.with_recorded(shorter)
+    model = problem.model.with_times(lambda source: {"times": 1e-3 * source.times, "t0": 1e-3 * source.t0})
     off = predictions(eqx.tree_at(lambda problem: problem.model, problem, model), points) - value
     off = off - measurements.whole_periods(off)
     # Candidates whose runs fail have no prediction.
@@ -515,22 +502,22 @@ def _refuse_milliseconds(explorer: Explorer, pool: Pool | None) -> None:
         )
 
 
-def _improved(problem: Problem, minima: Minima, sample: Pool, max_steps: int, progress: bool) -> Minima:
+def _improved(minima: Minima, sample: Pool, max_steps: int, progress: bool) -> Minima:
     """The minima, the best of them refined to the end; or those of the best points of the exploration, if these are better."""
-    count = min(LAST, len(minima.starts))
+    density, count = minima.density, min(LAST, len(minima.starts))
     order = sample.most_probable(count)
-    deviance = deviances(problem, sample.points[order], sample.predictions[order], minima.measurements)
+    deviance = deviances(density, sample.points[order], sample.predictions[order])
     if np.min(deviance) < np.min(minima.deviance) - IMPROVED:
-        later = refine(problem, sample.points[order], minima.measurements, min(max_steps, FEW_STEPS), progress)
-        is_better = np.min(later.weighed(problem, minima.measurements).deviance) < np.min(minima.deviance)
-        return minima.joined(problem, later) if is_better else minima
+        later = refine(density, sample.points[order], min(max_steps, FEW_STEPS), progress)
+        is_better = np.min(later.weighed(density).deviance) < np.min(minima.deviance)
+        return minima.joined(later) if is_better else minima
     if minima.converged[minima.best]:
         return minima
     rows = np.argsort(minima.deviance)[:count]
-    later = refine(problem, minima.coordinates[rows], minima.measurements, max_steps, progress)
+    later = refine(density, minima.coordinates[rows], max_steps, progress)
     # The rows that were fitted further replace the old ones.
     place = np.arange(len(minima.starts))
     place[rows] = len(place) + np.arange(count)
-    pair = minima.weighed(problem, later.measurements)[1:4], later[1:4]
+    pair = minima.weighed(later.density)[1:4], later[1:4]
     coordinates, converged, linearised = jax.tree.map(lambda old, new: np.concatenate([old, new])[place], *pair)
-    return Minima(minima.starts, coordinates, converged, linearised, later.measurements)
+    return Minima(minima.starts, coordinates, converged, linearised, later.density)

@@ -1,10 +1,11 @@
 """Fits of any model: their data, and the predictions that are compared with the data."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -14,11 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..compilation.xla_cpu import greatest
 from ..identification import AbstractRecording, Free, Identification, LogDensity, Measurements, Quantities, as_quantity
-from ..identification.likelihood import free_numbers, joined_data, of_data, own_name
-from ..identification.posterior import Prior
-from ..identification.recording import AbstractData
-from ..identification.result import check_search
-from ..identification.result import identify as most_likely
+from ..identification.posterior import Prior, as_free, own_name
+from ..identification.recording import AbstractData, numbered
+from ..identification.result import check_search, most_likely
 from ..integration import Settings
 from ..integration.problem import MOST_STEPS, tolerance_bound
 from ..parameters import full_name, require_apart
@@ -234,7 +233,7 @@ class EventTimes(AbstractEventTimes):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        return tuple(f"time {k + 1}" for k in range(self.size))
+        return tuple(f"time {k + 1}" for k in range(len(self.time)))
 
     def model(self, system: object) -> AbstractModel:
         model = model_of(system, self.launch, self.event, self.input, self.jumps)
@@ -252,6 +251,9 @@ AT_ONCE = 1e-6
 
 #: Parameters of one set of data, name -> (rows,).
 Values = dict[str, Float[Array, " rows"]]
+
+#: The horizon of a timed run [s]; or the times of samples, and the clock's reading at the start; with an axis for lanes.
+Horizon = Float[Array, "*lanes"] | tuple[Float[Array, "*lanes times"], Float[Array, "*lanes"]]
 
 #: A set of data of runs.
 Data = AbstractRecording | AbstractEventTimes
@@ -277,18 +279,6 @@ class Source(eqx.Module):
         return type(self.data), arrays, columns, getattr(self.data, "side", None), id(getattr(self.data, "event", None))
 
 
-class Lanes(eqx.Module):
-    """The runs of several sets of data in every row of parameters, one row after the other.
-
-    - `model`: with a value per lane for each number; `is_legal`: whether these values are legal.
-    - `horizon`: of timed runs [s], or the times of samples and the clock's reading at the start.
-    """
-
-    model: AbstractModel
-    is_legal: Bool[Array, "*lanes"]
-    horizon: Float[Array, " lanes"] | tuple[Float[Array, "lanes times"], Float[Array, " lanes"]]
-
-
 class DataModel(eqx.Module):
     """Predictions of several sets of data of a system, in the form that `nonholonomic.identification.result` expects.
 
@@ -304,10 +294,15 @@ class DataModel(eqx.Module):
         """The sets of data, for curves between their samples."""
         return tuple(source.data for source in self.data)
 
-    def with_recorded(self, recorded: tuple[Data, ...]) -> "DataModel":
-        """The model of other sets of data of the same shapes."""
-        pairs = zip(recorded, self.data, strict=True)
-        return dataclasses.replace(self, data=tuple(Source(data, source.model) for data, source in pairs))
+    def with_times(self, moved: Callable[[AbstractRecording], dict[str, Array | np.ndarray]]) -> "DataModel":
+        """The model of recordings at other times, of which `moved` returns the new fields of each."""
+        sources = []
+        for source in self.data:
+            data = source.data
+            if isinstance(data, AbstractRecording):
+                data = dataclasses.replace(data, **moved(data))
+            sources.append(Source(data, source.model))
+        return dataclasses.replace(self, data=tuple(sources))
 
     @property
     def on_host(self) -> bool:
@@ -322,13 +317,6 @@ class DataModel(eqx.Module):
             return "differences"
         model = self.data[0].model
         return "differences" if model.compiles_slowly else model.fit_slopes
-
-    @property
-    def series_units(self) -> tuple[str, ...]:
-        """The unit of each series of the measurements."""
-        counts = [int(np.max(source.data.measurements.series)) + 1 for source in self.data]
-        pairs = zip(self.data, counts, strict=True)
-        return tuple(unit for source, count in pairs for unit in source.data.units_of(source.model)[:count])
 
     def __call__(self, parameters: Values) -> Float[Array, "rows n"]:
         rows = len(next(iter(parameters.values())))
@@ -350,12 +338,18 @@ class DataModel(eqx.Module):
                 if isinstance(source.data, AbstractRecording):
                     parts[k] = of_source[:, 0, : len(source.data.times)].reshape(rows, -1)
                 else:
-                    parts[k] = jnp.broadcast_to(of_source, (rows, source.data.size))
+                    parts[k] = jnp.broadcast_to(of_source, (rows, len(source.data.time)))
         return jnp.concatenate([parts[k] for k in range(len(self.data))], axis=1)[:, self.seen]
 
 
-def _lanes(sources: list[Source], values: list[Values], rows: int) -> Lanes:
-    """The runs of sets of data with equal keys."""
+def _lanes(
+    sources: list[Source], values: list[Values], rows: int
+) -> tuple[AbstractModel, Bool[Array, " lanes"], Horizon]:
+    """The runs of sets of data with equal keys in every row of parameters, one row after the other.
+
+    **Returns:** the model with a value per lane for each number; whether these values are legal; and the horizons of timed
+    runs [s], or the times of samples and the clock's readings at the start.
+    """
     counts = [source.runs for source in sources]
 
     def in_lanes(of_each: list[Array]) -> Array:
@@ -383,27 +377,27 @@ def _lanes(sources: list[Source], values: list[Values], rows: int) -> Lanes:
         return model, model.legal()
 
     model, is_legal = eqx.filter_vmap(of_lane)(model, moved)
-    return Lanes(model, is_legal, horizon)
+    return model, is_legal, horizon
 
 
 def _predicted(sources: list[Source], values: list[Values], rows: int, settings: Settings) -> Float[Array, "lanes ..."]:
     """The predictions in all lanes; NaN for illegal parameters, and after the end of a run."""
     data: Any = sources[0].data
 
-    def of_lane(lane: Lanes) -> Array:
-        if not isinstance(data, AbstractRecording):
-            return nan_unless(lane.is_legal, data.predicted(lane.model, lane.horizon, settings))
+    def of_lane(model: AbstractModel, is_legal: Array, horizon: Horizon) -> Array:
+        if not isinstance(horizon, tuple):
+            return nan_unless(is_legal, data.predicted(model, horizon, settings))
         # Samples before the launch are taken at the launch. An illegal run might never end, so it ends at its start.
-        clock, t0 = lane.horizon
+        clock, t0 = horizon
         times = greatest(clock - t0, INSTANT * jnp.arange(clock.shape[0]))
-        times = jnp.where(lane.is_legal, times, 0.0)
+        times = jnp.where(is_legal, times, 0.0)
         # A sample at the time of a reset, as accurately as it is known, is the state before it.
         times = times * (1.0 + INSTANT) if data.side == "after" else times
-        run = sampled(lane.model, data.names, times, times[-1], settings)
-        columns = data.columns_of(lane.model, lane.model.read(data.names, times, run.rows, run.mode))
-        return nan_unless(lane.is_legal, jnp.stack(columns, axis=-1))
+        run = sampled(model, data.names, times, times[-1], settings)
+        columns = data.columns_of(model, model.read(data.names, times, run.rows, run.mode))
+        return nan_unless(is_legal, jnp.stack(columns, axis=-1))
 
-    return eqx.filter_vmap(of_lane)(_lanes(sources, values, rows))
+    return eqx.filter_vmap(of_lane)(*_lanes(sources, values, rows))
 
 
 _compiled = eqx.filter_jit(_predicted)
@@ -415,16 +409,16 @@ def _predicted_by_tables(
 ) -> Float[Array, "*lanes"]:
     """The times of events in all lanes, by the programs of tables; NaN for illegal parameters and for runs that failed or are
     unresolved."""
-    data, lanes = sources[0].data, _compiled_lanes(sources, values, rows)
+    data, (model, is_legal, horizon) = sources[0].data, _compiled_lanes(sources, values, rows)
     assert isinstance(data, AbstractEventTimes)
-    is_legal = np.asarray(lanes.is_legal)
+    is_legal = np.asarray(is_legal)
     size, count = len(is_legal), int(is_legal.sum())
     predictions = np.full(size, np.nan)
     if count:
         # However many lanes are legal, there are as many cells, hence one program; only the first cells run.
         order = np.argsort(~is_legal, kind="stable")
         order[count:] = order[0]
-        cells, t1 = jax.tree.map(lambda leaf: leaf[order] if eqx.is_array(leaf) else leaf, (lanes.model, lanes.horizon))
+        cells, t1 = jax.tree.map(lambda leaf: leaf[order] if eqx.is_array(leaf) else leaf, (model, horizon))
         status, time, ends = first_events(cells, np.asarray(t1), size, count, settings)
         time = data.of_ends(cells, t1, time, ends)
         predictions[order[:count]] = np.where(np.isin(status, SILENT), np.nan, time)[:count]
@@ -432,6 +426,11 @@ def _predicted_by_tables(
 
 
 # Estimate parameters of any model from recorded runs and from times of events, and their posterior.
+
+#: Stands for every set of data that has the parameter.
+EACH = "data[*]."
+
+Value = TypeVar("Value")
 
 #: The words for data that can be fitted.
 EXPECTED = "a nonholonomic.Recording or EventTimes"
@@ -545,14 +544,13 @@ def fit_runs(
     """
     check_search(**search)
     with status_line("fitting", search["progress"]):
-        model, measurements, labels, unknowns = prepared(system, data, free, expected, tolerance)
-        fit = most_likely(
-            model, measurements, unknowns, slopes=slopes or model.slopes(unknowns), labels=labels, **search
-        )
-    own = {name: own_name(name) for name in unknowns}
-    label = model.data[0].model.label
+        density = posterior_of_runs(system, data, free, None, expected, tolerance, slopes)
+        sources = density.problem.model.data
+        fit = most_likely(density, numbered([source.data.labels for source in sources]), **search)
+    own = {name: own_name(name) for name in density.problem.names}
+    label = sources[0].model.label
     units = {name: "s" if short == "t0" else label([short])[short][1] for name, short in own.items()}
-    return dataclasses.replace(fit, series_units=model.series_units, units=units)
+    return dataclasses.replace(fit, units=units)
 
 
 def posterior_of_runs(
@@ -562,24 +560,11 @@ def posterior_of_runs(
     priors: Mapping[str, Prior] | None,
     expected: str,
     tolerance: float,
+    slopes: str | None = None,
 ) -> LogDensity:
-    """The posterior, given sets of data of runs. **Arguments:** as for `log_density`; `expected`: as for `fit_runs`."""
-    model, measurements, _, unknowns = prepared(system, data, free, expected, tolerance)
-    if priors is not None and not isinstance(priors, dict):
-        raise ValueError(
-            f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation), only the standard "
-            "deviation, or a function"
-        )
-    by_name = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
-    return LogDensity.of(model, measurements, unknowns, by_name, model.series_units, model.slopes(unknowns))
+    """The posterior, given sets of data of runs.
 
-
-def prepared(
-    system: object, data: Data | Sequence[Data], free: Mapping[str, Free | float], expected: str, tolerance: float
-) -> tuple[DataModel, Measurements, tuple[str, ...], dict[str, Free]]:
-    """The predictions of the measurements, the measurements, their labels, and the unknowns, all checked.
-
-    **Arguments:** as for `fit_runs`.
+    **Arguments:** as for `log_density`; `expected`, `slopes`: as for `fit_runs`.
 
     **Raises:** `ValueError` unless there is at least one set of data, and all sets are recordings or times of events.
     """
@@ -589,22 +574,81 @@ def prepared(
         raise ValueError(f"data = {shown(data)} must be {expected}, or a list of them{reader}")
     tolerance_bound(tolerance).require()
     sources = tuple(Source(source, source.model(system)) for source in several)
-    own = []
+    for source in sources:
+        data = source.data
+        end = data.times[-1] - data.t0 if isinstance(data, AbstractRecording) else data.horizon
+        check_run(source.model, end, tolerance)
+    unknowns = free_numbers(free, sources)
+    require_apart("free", unknowns)
+    offsets = np.cumsum([0, *(source.size for source in several)])
+    seen = np.concatenate([first + source.seen for first, source in zip(offsets, several, strict=False)])
+    model = DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS))
+    if priors is not None and not isinstance(priors, dict):
+        raise ValueError(
+            f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation), only the standard "
+            "deviation, or a function"
+        )
+    by_name = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
+    parts, units = [], []
+    for source in sources:
+        part = source.data.measurements
+        # The series are renumbered consecutively.
+        parts.append(eqx.tree_at(lambda part: part.series, part, part.series + len(units)))
+        units += source.data.units_of(source.model)[: int(np.max(part.series)) + 1]
+    measurements = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return LogDensity.of(model, measurements, unknowns, by_name, tuple(units), slopes or model.slopes(unknowns))
+
+
+def of_data(parameters: dict[str, Value], k: int) -> dict[str, Value]:
+    """The parameters of one set of data: the shared parameters, and its own parameters without the prefix `data[k].`."""
+    prefix = f"data[{k}]."
+    pairs = ((name.removeprefix(prefix), value) for name, value in parameters.items())
+    return {name: value for name, value in pairs if not name.startswith("data[")}
+
+
+def free_numbers(free: Mapping[str, Free | float], sources: Sequence[Source]) -> dict[str, Free]:
+    """The unknowns of a model and its data: their full names, and a lower bound of 0 for parameters that cannot be negative.
+
+    **Arguments:** `free`: name, or its unambiguous end, -> a `Free` or a start value. `data[1].launch.azimuth` is a
+    parameter of the second set of data alone, and `data[*].launch.azimuth` stands for one parameter of each set. A
+    parameter of a launch without a prefix is shared.
+
+    **Returns:** full name -> `Free`.
+
+    **Raises:** `ValueError` for an unknown name or illegal start values.
+    """
+    first, own = sources[0].model, []
     for source in sources:
         names = [name for name in source.model.known if name.startswith(("start", "launch"))]
-        if isinstance(source.data, AbstractRecording):
-            names, end = [*names, "t0"], source.data.times[-1] - source.data.t0
+        own.append([*names, "t0"] if isinstance(source.data, AbstractRecording) else names)
+    shared = [name for name in first.known if name not in own[0]]
+
+    def check(values: dict[str, float]) -> None:
+        first.require_values({own_name(name): value for name, value in values.items() if own_name(name) != "t0"})
+
+    of_any = list(dict.fromkeys(itertools.chain(*own)))
+    of_each = [f"data[{k}].{name}" for k, names in enumerate(own) for name in names]
+    unknowns: dict[str, Free] = {}
+    for written, unknown in as_free(free).items():
+        if str(written).startswith(EACH):
+            end = full_name("free", written.removeprefix(EACH), of_any)
+            names = [name for name in of_each if own_name(name) == end]
         else:
-            end = source.data.horizon
-        own.append(names)
-        check_run(source.model, end, tolerance)
-    first = sources[0].model
-    unknowns = free_numbers(
-        free,
-        [name for name in first.known if name not in own[0]],
-        own,
-        lambda values: first.require_values({name: value for name, value in values.items() if name != "t0"}),
-    )
-    require_apart("free", unknowns)
-    measurements, labels, seen = joined_data(several)
-    return DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS)), measurements, labels, unknowns
+            known = of_each if str(written).startswith("data[") else [*shared, *of_any]
+            names = [full_name("free", written, known)]
+        for name in names:
+            if name in unknowns:
+                raise ValueError(f"free: {name!r} is named twice")
+            unknowns[name] = unknown
+    for name in unknowns:
+        if own_name(name) != name and own_name(name) in unknowns:
+            raise ValueError(f"free: {name!r} is named twice, alone and for all data")
+    for k in range(len(own)):
+        check({name: unknown.start for name, unknown in of_data(unknowns, k).items()})
+    for name, unknown in unknowns.items():
+        if unknown.lower == -math.inf and unknown.upper == math.inf:
+            try:
+                check({name: -(abs(unknown.start) or 1.0)})
+            except ValueError:
+                unknowns[name] = unknown._replace(lower=0.0)
+    return as_free(unknowns)

@@ -422,7 +422,7 @@ class _Drawn(NamedTuple):
 
     @classmethod
     def of(cls, fit: "Identification", unit: Unit) -> "_Drawn":
-        numbers, names = np.asarray(fit.measurements.series), []
+        numbers, names = np.asarray(fit.density.measurements.series), []
         series, factors = [np.flatnonzero(numbers == number) for number in np.unique(numbers)], np.ones(len(numbers))
         for k, indices in enumerate(series):
             label = fit.residuals[indices[0]].label
@@ -436,7 +436,7 @@ class _Drawn(NamedTuple):
         )
         is_limit = np.array([row.censored for row in fit.residuals])
         # Draw an angle on the same turn as its prediction.
-        turns = factors * np.asarray(fit.measurements.whole_periods((predicted - value) / factors))
+        turns = factors * np.asarray(fit.density.measurements.whole_periods((predicted - value) / factors))
         value, (times, curves) = np.where(is_limit, value, value + turns), fit.curves
         curves = factors * curves if len(curves) else curves
         return cls(series, names, value, upper, errors, predicted, is_limit, times, curves)
@@ -458,7 +458,7 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figur
 
     **Returns:** a matplotlib figure.
     """
-    names, drawn, times = list(fit.estimates), _Drawn.of(fit, unit), np.asarray(fit.measurements.time)
+    names, drawn, times = list(fit.estimates), _Drawn.of(fit, unit), np.asarray(fit.density.measurements.time)
     profiled = [name for name in names if np.isfinite(fit.standard_errors[name])][:MOST_PROFILES]
     # The correlations of one number say nothing.
     correlated = len(names) > 1
@@ -507,7 +507,7 @@ def _draw_block(
     """Draw series over their times, or over the numbers of their measurements: the data and the residuals."""
     indices = np.concatenate([drawn.series[k] for k in block])
     abscissa = np.full(len(drawn.value), np.nan)
-    abscissa[indices] = np.asarray(fit.measurements.time)[indices] if has_time else np.arange(len(indices))
+    abscissa[indices] = np.asarray(fit.density.measurements.time)[indices] if has_time else np.arange(len(indices))
     panels, first = drawn.panels(block), None
     grid = place.subgridspec(len(panels) + 1, 1, height_ratios=[2.0] * len(panels) + [1.0])
     for row, (name, series) in enumerate(panels.items()):

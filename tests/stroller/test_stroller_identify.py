@@ -35,7 +35,7 @@ def test_damping_from_recorded_speeds(tmp_path, caplog):
     posterior = stroller.log_density(scene(), data, {"rolling": 1.5, "t0": 0.85}, tolerance=1e-7)
     # As many rows as in an exploration of the fit, whose program they share.
     rows = np.tile(np.stack([second_fit.coordinates, posterior.start]), (256, 1))
-    predicted = posterior.predictions(rows)
+    predicted = posterior.predict(rows)
     assert_close(predicted[0], speeds, rtol=1e-6)
     assert np.max(np.abs(predicted[1] - speeds)) > 0.01
 
@@ -48,9 +48,7 @@ HALVED = nonholonomic.EventTimes(
 
 def test_the_time_of_an_event_is_predicted():
     posterior = stroller.log_density(scene(), HALVED, {"rolling": 1.5})
-    assert_close(
-        posterior.predictions(np.log([[2.0], [1.5]]))[:, 0], np.log(2.0) * 12.0 / np.array([2.0, 1.5]), rtol=1e-7
-    )
+    assert_close(posterior.predict(np.log([[2.0], [1.5]]))[:, 0], np.log(2.0) * 12.0 / np.array([2.0, 1.5]), rtol=1e-7)
 
 
 @pytest.mark.slow

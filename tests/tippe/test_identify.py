@@ -15,7 +15,7 @@ from tops import rutstam_top
 
 import nonholonomic
 import tippe
-from nonholonomic.identification import Free, Measurements
+from nonholonomic.identification import Free, LogDensity, Measurements
 from nonholonomic.identification.posterior import linearise
 from nonholonomic.identification.search import coordinate_covariance, minimise
 
@@ -98,7 +98,7 @@ def test_another_start_other_bounds_data_and_tolerance_compile_nothing(exact_fit
         second_fit = tippe.identify(rutstam_scene, other_data, {"friction.mu": Free(0.25, 0.05)}, tolerance=1e-7)
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
     # Each of these numbers counted.
-    assert second_fit.problem.unknowns[0].lower == 0.05
+    assert second_fit.density.problem.unknowns.lower[0] == 0.05
     assert second_fit.estimates["scene.friction.mu"] < 0.298
 
 
@@ -112,8 +112,9 @@ def test_noisy_times_give_unbiased_friction_within_its_errors(exact_fit):
     exact, error, z = np.where(np.isfinite(times), times, 6.0), 0.002, []
     for draw in np.random.default_rng(7).normal(size=(12, 4)):
         noisy_data = Measurements(exact + error * draw, error, np.isinf(times))
-        ends = minimise(result.problem, result.coordinates[None], noisy_data)
-        linearised = linearise(result.problem, ends.coordinates, noisy_data)
+        density = LogDensity(result.density.problem, noisy_data, ())
+        ends = minimise(density, result.coordinates[None])
+        linearised = linearise(density, ends.coordinates)
         z.append(
             (ends.coordinates[0, 0] - math.log(0.3)) / math.sqrt(coordinate_covariance(linearised.information[0])[0, 0])
         )
@@ -164,7 +165,7 @@ def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tab
     free = {"scene.friction.mu": 0.3, "scene.body.offset": 0.006, "scene.gravity": 9.81}
     problem = tippe.log_density(rutstam_scene, data, free, tolerance=1e-11).problem
     point = jnp.log(jnp.array([[0.3, 0.006, 9.81]])) + jnp.zeros((tables, 1))
-    slopes = linearise(problem, point, Measurements(np.full(4, 2.0), 1.0)).jacobian
+    slopes = linearise(LogDensity(problem, Measurements(np.full(4, 2.0), 1.0), ()), point).jacobian
     predict = eqx.filter_jit(problem.predict)
     for k in range(3):
 
@@ -264,8 +265,9 @@ def test_two_hundred_noisy_tables_give_unbiased_estimates_and_intervals_that_cov
     draw = np.random.default_rng(0)
     noisy_data = Measurements(exact + error * draw.normal(size=(200, 10)), error)
     start_points = truth + 0.05 * draw.uniform(-1.0, 1.0, (200, 2))
-    ends = minimise(problem, start_points, noisy_data)
-    linearised = linearise(problem, ends.coordinates, noisy_data)
+    density = LogDensity(problem, noisy_data, ())
+    ends = minimise(density, start_points)
+    linearised = linearise(density, ends.coordinates)
     errors = np.array(
         [np.sqrt(np.diag(coordinate_covariance(np.asarray(jacobian)))) for jacobian in linearised.jacobian]
     )
@@ -292,9 +294,9 @@ def test_single_starts_a_factor_two_off_find_the_truth(experiment, capsys):
     tables = 25
     offsets = np.log(2.0) * np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)])
     noisy_data = np.repeat(exact + error * np.random.default_rng(1).normal(size=(tables, 10)), len(offsets), axis=0)
-    measurements = Measurements(noisy_data, error)
-    ends = minimise(problem, np.tile(truth + offsets, (tables, 1)), measurements)
-    linearised = linearise(problem, ends.coordinates, measurements)
+    density = LogDensity(problem, Measurements(noisy_data, error), ())
+    ends = minimise(density, np.tile(truth + offsets, (tables, 1)))
+    linearised = linearise(density, ends.coordinates)
     errors = np.array(
         [np.sqrt(np.diag(coordinate_covariance(np.asarray(jacobian)))) for jacobian in linearised.jacobian]
     )

@@ -51,7 +51,7 @@ def test_draws_of_a_top_that_sticks_are_those_of_its_fit():
         return tippe.log_density(scene, data(time), {"mu": mu}, tolerance=1e-6)
 
     # So many rows, here and in the fit, that one program serves all.
-    exact = density(1.0, 0.3).predictions(np.full((80, 1), np.log(0.3)))[0, 0]
+    exact = density(1.0, 0.3).predict(np.full((80, 1), np.log(0.3)))[0, 0]
     fit = tippe.identify(scene, data(exact), {"mu": 0.27}, starts=24, tolerance=1e-6, progress=False)
     low, high = fit.interval("mu")
     assert low < 0.3 < high

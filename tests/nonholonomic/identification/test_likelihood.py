@@ -10,7 +10,7 @@ import scipy.stats
 from close import assert_close
 
 from nonholonomic.identification import Measurements, identify
-from nonholonomic.identification.likelihood import between
+from nonholonomic.identification.posterior import between
 
 phi = scipy.stats.norm
 

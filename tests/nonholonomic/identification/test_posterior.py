@@ -79,7 +79,7 @@ def test_priors_and_bounds_stay_with_their_unknowns(names):
     density = LogDensity.of(model, data, {name: KINDS[name] for name in names}, function)
     points = np.asarray(density.start) + 0.3 * np.random.default_rng(0).normal(size=(4, 4))
     expected = sum(expected_log_prior(name, points[:, k]) for k, name in enumerate(names))
-    assert_close(density.log_priors(points), expected, rtol=1e-10)
+    assert_close(density.problem.unknowns.log_priors(points), expected, rtol=1e-10)
 
     def single(point, prediction):
         """The density less the likelihood with the errors of the point."""
@@ -303,5 +303,5 @@ def test_one_program_predicts_any_number_of_rows_and_skips_rows_of_nan():
         rows = np.linspace(0.5, 1.5, count)[:, None]
         # One of four calls has rows of NaN only.
         rows[count // 4 : count // 4 + 90] = np.nan
-        np.testing.assert_array_equal(density.predictions(rows), (1.0 + rows) * np.array([1.0, 2.0]))
+        np.testing.assert_array_equal(density.predict(rows), (1.0 + rows) * np.array([1.0, 2.0]))
     assert len(traced) == 1

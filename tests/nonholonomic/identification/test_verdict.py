@@ -13,9 +13,8 @@ import scipy.stats
 from close import assert_close
 from matplotlib.figure import Figure
 
-from nonholonomic.identification import FitWarning, Free, Measurements, identify
+from nonholonomic.identification import FitWarning, Free, LogDensity, Measurements, identify
 from nonholonomic.identification.conclusions import normal_scores, runs_of_signs
-from nonholonomic.identification.posterior import Problem
 from nonholonomic.identification.search import refine
 
 T = np.linspace(0.0, 4.0, 115)
@@ -140,13 +139,13 @@ def test_the_better_of_two_searches_is_that_of_the_smaller_residuals(seed, swapp
     """Each search estimates the unknown error for itself, so that both end with the same -2 log likelihood."""
     value = np.sin(6.0 * T) + 0.5 * np.random.default_rng(seed).normal(size=T.size)
     data = Measurements(value, 1.0, estimated=True)
-    problem = Problem(oscillation, {"height": Free(1.0), "rate": Free(6.0)})
-    near, far = (refine(problem, np.array([[1.0, rate]]), data, 60, False) for rate in (0.0, 1.0))
+    density = LogDensity.of(oscillation, data, {"height": Free(1.0), "rate": Free(6.0)})
+    near, far = (refine(density, np.array([[1.0, rate]]), 60, False) for rate in (0.0, 1.0))
     scatter = [np.std(value - minima.linearised.prediction[0]) for minima in (near, far)]
     assert scatter[0] < 0.8 * scatter[1]
-    both = far.joined(problem, near) if swapped else near.joined(problem, far)
+    both = far.joined(near) if swapped else near.joined(far)
     assert_close(both.coordinates[both.best], near.coordinates[0])
-    assert_close(both.measurements.error, near.measurements.error)
+    assert_close(both.density.measurements.error, near.density.measurements.error)
 
 
 def test_as_many_unknowns_as_measurements_leave_nothing_to_judge_by():
@@ -180,7 +179,7 @@ def test_a_picture_has_limits_at_its_edge_and_other_units():
     """A limit far from the measured values does not squeeze these."""
     seen = Measurements([0.10, 0.12, 0.11, 7.0, -math.inf], 0.01, upper=[0.10, 0.12, 0.11, math.inf, 9.0])
     fit = identify(lambda p: p["x"][:, None] * jnp.array([1.0, 1.0, 1.0, 80.0, 80.0]), seen, {"x": 0.11})
-    fit = dataclasses.replace(fit, series_units=("rad",), units={"x": "rad"})
+    fit = dataclasses.replace(fit, density=dataclasses.replace(fit.density, series_units=("rad",)), units={"x": "rad"})
     data, residuals, profile = fit.plot(unit="deg").axes
     low, high = data.get_ylim()
     assert math.degrees(0.05) < low < math.degrees(0.09)
