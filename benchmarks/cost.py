@@ -28,7 +28,7 @@ from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, so
 from nonholonomic.parameters import with_numbers
 from stroller.model.scene import RideProblem
 from tippe.modes.problems import InversionProblem
-from tippe.runs.model import TopModel
+from tippe.runs.model import TopModel, modes_of
 
 RECORD = Path(__file__).with_name("cost.json")
 
@@ -98,10 +98,10 @@ def of_top(scene: tippe.Scene) -> tuple[AbstractProblem, ...]:
 
 
 def _problems_of_top(scene: tippe.Scene, launch: tippe.Launch) -> tuple[AbstractProblem, ...]:
-    problem, kind = InversionProblem.of(scene, launch, ANGLE, LAUNCHES), TopModel(scene=scene, launch=launch).kind
-    if kind.modes is None:
+    problem = InversionProblem.of(scene, launch, ANGLE, LAUNCHES)
+    if TopModel(scene=scene, launch=launch).smooth:
         return (problem,)
-    modes, _ = kind.modes(scene, problem, 1e-9, False)
+    modes, _ = modes_of(scene, problem, 1e-9, False)
     return tuple(mode.problem(problem.states) for mode in modes)
 
 

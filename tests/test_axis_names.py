@@ -14,8 +14,8 @@ import nonholonomic.sweeps
 import stroller
 import tippe
 from nonholonomic.parameters import numbers
-from tippe.runs.launches import launches
 from tippe.runs.model import TopModel
+from tippe.runs.verbs import launches
 
 pytestmark = pytest.mark.oldest
 

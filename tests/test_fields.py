@@ -17,7 +17,7 @@ import tippe
 from stroller.model.scene import RideProblem
 from tippe.modes.impact import FreeBody, Impact, Skid, approach, balls
 from tippe.modes.problems import InversionProblem, trajectory_problem
-from tippe.runs.model import TopModel
+from tippe.runs.model import TopModel, modes_of
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
 SLOW = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1"}
@@ -65,10 +65,10 @@ def slow_in_problem(problem):
 
 def table_problems(scene, launch):
     """The problems that a table of the scene integrates: one, or that of every mode."""
-    problem, driver = InversionProblem.of(scene, launch, 3.0, 1), TopModel(scene=scene, launch=launch).kind
-    if driver.modes is None:
+    problem = InversionProblem.of(scene, launch, 3.0, 1)
+    if TopModel(scene=scene, launch=launch).smooth:
         return (problem,)
-    modes, _ = driver.modes(scene, problem, 1e-9, True)
+    modes, _ = modes_of(scene, problem, 1e-9, True)
     return tuple(mode.problem(problem.states) for mode in modes)
 
 

@@ -25,7 +25,7 @@ from nonholonomic.views.explore import live_page
 from . import paper, presets, steady
 from .friction import Coulomb
 from .model.scene import Launch, Scene
-from .runs.launches import INVERTED
+from .modes.problems import INVERTED
 from .runs.model import TopModel
 from .runs.verbs import inversion_table
 from .runs.view import Panel, draw_launches, page_of_launch, stage_at_start, theta_over_time
@@ -230,10 +230,8 @@ def headings(options: argparse.Namespace) -> dict[str, str]:
 
 def report(options: argparse.Namespace, arena: str, table: Table) -> str:
     """The table of an arena as text."""
-    rows = rows_of(options, table)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(entry.rjust(width) for entry, width in zip(row, widths, strict=True)) for row in rows]
-    return "\n".join(["", f"Time until it has turned over, {headings(options)[arena]}", *lines])
+    heading = f"Time until it has turned over, {headings(options)[arena]}"
+    return "\n".join(["", heading, *paper.aligned(rows_of(options, table))])
 
 
 def picture(options: argparse.Namespace, times: Times, theta: Times, plane: Table) -> "Figure":

@@ -31,9 +31,9 @@ from nonholonomic.text import distinguishing_labels
 from nonholonomic.validation import as_number, is_traced, require_kind, require_scalars, warn
 
 from .model.scene import Launch, Scene, as_launch
-from .runs.launches import angle_of, check_event, check_reversible, check_smooth, event_of, require_rigid
+from .modes.problems import angle_of, event_of
 from .runs.model import TopModel
-from .runs.verbs import ExtendedTime, beyond_horizon
+from .runs.verbs import ExtendedTime, beyond_horizon, check_event, check_reversible, check_smooth
 
 #: The words for data that can be fitted.
 EXPECTED = "an InversionTimes, a ReversalTimes or a Recording"
@@ -267,8 +267,7 @@ class ReversalTimes(AbstractTimes):
     def model(self, system: object) -> TopModel:
         require_kind(system, "scene", Scene)
         assert isinstance(system, Scene)
-        require_rigid(system)
-        check_reversible(self.launch, {})
+        check_reversible(system, self.launch)
         return TopModel.timed(system, self.launch, None)
 
 

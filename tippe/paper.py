@@ -9,6 +9,7 @@ motion are not those of a top (`benchmarks/papers/tippe_audit.py`). The same lau
 
 import argparse
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from pathlib import Path
@@ -130,8 +131,22 @@ def parser() -> argparse.ArgumentParser:
     return command
 
 
-def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The declared top in the two arenas of the papers, or in the requested arena."""
+class Arena(NamedTuple):
+    """An arena of the report.
+
+    - `name`, `scene`: its name, and the declared top in it.
+    - `etas`: the places eta(0) [rad]; none where `eta` names no places, and every launch starts at the origin.
+    - `spin`: spin of the launches [rad/s].
+    """
+
+    name: str
+    scene: Scene[Top]
+    etas: list[float]
+    spin: float
+
+
+def arenas_of(options: argparse.Namespace) -> dict[str, Arena]:
+    """The two arenas of the papers, and the requested arena, by the names of their files."""
     inertia = options.mass * options.radius**2
     I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
     I3 = 0.4 * inertia if options.I3 is None else options.I3
@@ -139,10 +154,15 @@ def scenes(options: argparse.Namespace) -> dict[str, Scene]:
     friction: AbstractFriction = Viscous(options.mu)
     if options.slip_speed is not None:
         friction = Coulomb(options.mu, options.slip_speed)
-    arenas = {"cylinder": Cylinder(options.cylinder_radius), "plane": Plane()}
+    surfaces = {"cylinder": ("cylinder", Cylinder(options.cylinder_radius)), "plane": ("plane", Plane())}
     if options.surface is not None:
-        arenas["surface"] = surface_of(options.surface)
-    return {name: Scene(top, arena, friction, options.gravity) for name, arena in arenas.items()}
+        surfaces["surface"] = (" ".join(options.surface), surface_of(options.surface))
+    spin, arenas = options.beta1 / float(top.I3) if options.spin is None else options.spin, {}
+    for file, (name, surface) in surfaces.items():
+        counts_eta = any(coordinate == "eta" for coordinate, _ in surface.coordinates)
+        scene = Scene(top, surface, friction, options.gravity)
+        arenas[file] = Arena(name, scene, options.eta if counts_eta else [], spin)
+    return arenas
 
 
 def surface_of(words: list[str]) -> AbstractSurface:
@@ -161,36 +181,21 @@ def surface_of(words: list[str]) -> AbstractSurface:
     raise ValueError(f"--surface {' '.join(words)} must be one of: {', '.join(SURFACES)}")
 
 
-def shown_name(options: argparse.Namespace, arena: str) -> str:
-    """The name of an arena in the report."""
-    return " ".join(options.surface) if arena == "surface" else arena
-
-
-def counts_eta(scene: Scene[Top]) -> bool:
-    """Whether `eta` names places on an arena; on other arenas, every launch starts at the origin."""
-    return any(name == "eta" for name, _ in scene.surface.coordinates)
-
-
-def spin_of(options: argparse.Namespace, scene: Scene[Top]) -> float:
-    """The launches' spin [rad/s]."""
-    return options.beta1 / float(scene.body.I3) if options.spin is None else options.spin
-
-
 def tables(options: argparse.Namespace) -> dict[str, Table]:
     """The table of each arena, first and last crossing of the angle, written to its file."""
-    arenas, by_arena = scenes(options), {}
+    arenas, by_arena = arenas_of(options), {}
     require_folder(options.out, "--out")
-    for name, scene in arenas.items():
-        by_arena[name] = inversion_table(
-            scene,
+    for file, arena in arenas.items():
+        by_arena[file] = inversion_table(
+            arena.scene,
             theta=options.theta,
-            eta=options.eta if counts_eta(scene) else 0.0,
-            spin=spin_of(options, scene),
+            eta=arena.etas or 0.0,
+            spin=arena.spin,
             t1=options.t1,
             angle=options.angle,
             tolerance=options.tolerance,
             crossing="both",
-            path=options.out / f"{name}.h5",
+            path=options.out / f"{file}.h5",
         )
     return by_arena
 
@@ -200,15 +205,15 @@ def rows_of(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[tup
     those of the paper if the launches are its own."""
     columns = [["theta(0)", "[rad]", *(f"{theta:.4g}" for theta in options.theta)]]
     words = {"not_inverted": "-", "contact_lost": "lost contact", "does_not_fit": "no room"}
-    for arena, scene in scenes(options).items():
-        table, name = by_arena[arena], shown_name(options, arena)
-        places = [(f"eta={eta:.4g}", eta, (slice(None), i)) for i, eta in enumerate(options.eta)]
-        for place, eta, cells in places if counts_eta(scene) else [("", math.nan, (slice(None),))]:
+    for file, arena in arenas_of(options).items():
+        table = by_arena[file]
+        places = [(f"eta={eta:.4g}", eta, (slice(None), i)) for i, eta in enumerate(arena.etas)]
+        for place, eta, cells in places or [("", math.nan, (slice(None),))]:
             for crossing, times in (("first", table.first_time), ("last", table.last_time)):
                 ends = zip(times[cells], table.status[cells], strict=True)
                 entries = [f"{end:.4f}" if math.isfinite(end) else str(words.get(word, word)) for end, word in ends]
-                columns.append([f"{name} {place}", f"{crossing} [s]", *entries])
-            for printed in (TABLE_2, TABLE_3) if arena == "cylinder" else ():
+                columns.append([f"{arena.name} {place}", f"{crossing} [s]", *entries])
+            for printed in (TABLE_2, TABLE_3) if file == "cylinder" else ():
                 if list(options.theta) == [row.theta for row in printed.rows] and math.isclose(eta, printed.eta):
                     columns.append(
                         ["paper", "[s]", *("-" if row.time is None else f"{row.time:g}" for row in printed.rows)]
@@ -218,15 +223,18 @@ def rows_of(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[tup
 
 def report(options: argparse.Namespace, by_arena: dict[str, Table]) -> str:
     """The tables side by side, as text."""
-    rows = rows_of(options, by_arena)
+    return "\n".join([*described(options), "", *aligned(rows_of(options, by_arena))])
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The rows of a table as lines of text, with columns of equal width."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join([*described(options), "", *lines])
+    return ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def described(options: argparse.Namespace) -> list[str]:
     """The lines above the report."""
-    scene = scenes(options)["cylinder"]
+    scene = arenas_of(options)["cylinder"].scene
     body, law = scene.body, scene.friction
     friction = f"{'viscous' if isinstance(law, Viscous) else 'Coulomb'} mu = {options.mu:g}"
     friction += " s/m" if isinstance(law, Viscous) else f", slip speed {options.slip_speed:g} m/s"
@@ -253,32 +261,27 @@ def drawn(options: argparse.Namespace, t1: float) -> tuple[np.ndarray, dict[str,
     All numbers are arrays: another Python number would compile a new program, so the picture and the page could not
     share programs. The arenas' programs are compiled in parallel, because the compiler uses little more than one core.
     """
-    arenas, times = scenes(options), np.linspace(0.0, t1, SAMPLES)
+    arenas, times = arenas_of(options), np.linspace(0.0, t1, SAMPLES)
     tolerance = np.asarray(options.tolerance)
+
+    def run(arena: Arena) -> Frame:
+        eta, theta = (values.ravel() for values in np.meshgrid(arena.etas or [0.0], options.theta, indexing="ij"))
+        launches = Launch(theta, np.full_like(theta, arena.spin), eta, np.zeros_like(theta))
+        return moving(arena.scene, launches, times, tolerance)
+
     with Progress(len(arenas), "arena", "compiling the drawing"), ThreadPoolExecutor(2) as threads:
-        runs = threads.map(lambda scene: moving(scene, starts(options, scene)[1], times, tolerance), arenas.values())
-        return times, dict(zip(arenas, runs, strict=True))
-
-
-def starts(options: argparse.Namespace, scene: Scene[Top]) -> tuple[list[float], Launch]:
-    """The places eta(0) of an arena, and the launches from all of them."""
-    etas = options.eta if counts_eta(scene) else [0.0]
-    eta, theta = (values.ravel() for values in np.meshgrid(etas, options.theta, indexing="ij"))
-    return etas, Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
+        return times, dict(zip(arenas, threads.map(run, arenas.values()), strict=True))
 
 
 def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
     """theta(t) of every launch."""
     times, runs = drawn(options, options.t1)
     panels, thetas = [], np.asarray(options.theta)
-    for arena, scene in scenes(options).items():
-        etas, _ = starts(options, scene)
-        angles = np.asarray(runs[arena].curves[0]).reshape(len(etas), len(thetas), -1)
-        ends = by_arena[arena].last_time.reshape(len(thetas), len(etas))
-        for i, eta in enumerate(etas):
-            name = shown_name(options, arena)
-            title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
-            panels.append(Panel(title, times, angles[i], thetas, ends[:, i]))
+    for file, arena in arenas_of(options).items():
+        titles = [f"{arena.name}, η(0) = {eta:.4g}" for eta in arena.etas] or [arena.name]
+        angles = np.asarray(runs[file].curves[0]).reshape(len(titles), len(thetas), -1)
+        ends = by_arena[file].last_time.reshape(len(thetas), len(titles))
+        panels += [Panel(title, times, angles[i], thetas, ends[:, i]) for i, title in enumerate(titles)]
     return draw_launches(panels, options.angle, "Dots: above the dashed angle for good")
 
 
@@ -287,14 +290,15 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[vie
     turns over."""
     ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in by_arena.values()]).max(axis=0)
     # In a longer run, the samples would be too far apart to follow the spin.
-    step = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
+    arenas = arenas_of(options)
+    step = SAMPLES / abs(arenas["plane"].spin)
     tilt = np.where(ends + 0.5 <= step, options.theta, np.inf)
     row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
     last = min(options.t1, step, float(ends[row]) + 0.5)
     (times, runs), groups = drawn(options, last), []
-    for arena, scene in scenes(options).items():
-        name = f"{shown_name(options, arena)}, θ(0) = {options.theta[row]:.4g} rad"
-        groups.append([(name, scene, times, jax.tree.map(lambda part: np.asarray(part)[row], runs[arena]))])
+    for file, arena in arenas.items():
+        name = f"{arena.name}, θ(0) = {options.theta[row]:.4g} rad"
+        groups.append([(name, arena.scene, times, jax.tree.map(lambda part: np.asarray(part)[row], runs[file]))])
     return stages(groups)
 
 

@@ -70,11 +70,6 @@ def _require_top(body: object, caller: str | None = None) -> None:
         require_scalars(numbers("body", body), MANY)
 
 
-def _require_one_scene(scene: Scene, **values: object) -> None:
-    """Raise `ValueError` unless the numbers of the scene, and the values, are scalars."""
-    require_scalars(numbers("scene", scene, functions=False) | values, MANY)
-
-
 def _require_scene_of_a_top(scene: Scene, any_arena: bool = False) -> None:
     """Raise `ValueError` unless this is a scene of a `Top`, on a level plane if not on `any_arena`."""
     require_kind(scene, "scene", Scene)
@@ -197,7 +192,7 @@ def tumbling_angles(scene: Scene[Top], jellett: float, samples: int = 2001) -> l
     """
     _require_scene_of_a_top(scene)
     require(jellett, "jellett")
-    _require_one_scene(scene, jellett=jellett)
+    require_scalars(numbers("scene", scene, functions=False) | {"jellett": jellett}, MANY)
     require_whole(samples, "samples", 4)
     grid = jnp.linspace(0.0, jnp.pi, samples)
 
@@ -414,7 +409,7 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
     (6, 6)
     """
     _require_standing(scene, spin, inverted)
-    _require_one_scene(scene, spin=spin)
+    require_scalars(numbers("scene", scene, functions=False) | {"spin": spin}, MANY)
     body = dataclasses.replace(scene.body, stem=None) if scene.contact == "hybrid" else scene.body
     scene = dataclasses.replace(scene, body=body, contact="stop", restitution=None)
     return _standing_matrix(scene, as_number(spin), bool(inverted))
@@ -452,7 +447,8 @@ def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
     """
     _require_scene_of_a_top(scene)
     require_kind(motion, "motion", Tumbling, A_MOTION)
-    _require_one_scene(scene, **{f"motion.{name}": value for name, value in motion._asdict().items()})
+    values = {f"motion.{name}": value for name, value in motion._asdict().items()}
+    require_scalars(numbers("scene", scene, functions=False) | values, MANY)
     return _tumbling_matrix(scene, motion)
 
 

@@ -14,7 +14,7 @@ import tippe
 from nonholonomic.integration import Oscillatory8, Settings, solve_ensemble
 from stroller.model.scene import RideProblem
 from tippe.modes.problems import InversionProblem
-from tippe.runs.model import TopModel
+from tippe.runs.model import modes_of
 
 T1, TOLERANCE, SETTINGS = 8.0, 1e-6, Settings(1e-6, Oscillatory8())
 THETAS, TIMES = jnp.linspace(0.05, 0.15, 4), jnp.linspace(0.0, 1.0, 11)
@@ -55,7 +55,7 @@ def hybrid_table(law, thetas):
     flying = scene(law=law, contact="hybrid") if law is tippe.Viscous else scene(law=law)
     launch, cells = tippe.Launch(thetas, 155.0), len(thetas)
     problem = InversionProblem.of(flying, launch, 3.0, cells)
-    modes, _ = TopModel(scene=flying, launch=launch).kind.modes(flying, problem, TOLERANCE, False)
+    modes, _ = modes_of(flying, problem, TOLERANCE, False)
     left = jnp.full(cells, T1)
     return [(ended(mode.problem(problem.states), cells), mode.reset_map(problem.states, left)) for mode in modes]
 

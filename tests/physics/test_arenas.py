@@ -1,5 +1,6 @@
 """The top on any arena: an independent program, the forms of its own arenas, and where it does not fit."""
 
+import dataclasses
 import math
 
 import equinox as eqx
@@ -16,7 +17,6 @@ import tippe
 from nonholonomic.geometry import frame_of
 from nonholonomic.validation import as_number
 from tippe.friction import AbstractFriction, ContactLoad
-from tippe.model.dynamics import Dynamics
 
 REFERENCE = recorded()
 
@@ -118,7 +118,7 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
     first = (*surface.in_own_axes(foot), *surface.in_own_axes(axes[0]))
     motions = []
     for frame, start, path in ((scene.frame, own_place, own_path), (general_frame, first, ())):
-        dynamics = Dynamics.of(scene.body, frame, scene.friction, scene.gravity)
+        dynamics = dataclasses.replace(scene.dynamics, frame=frame)
         size = 8 + len(start)
         y = np.concatenate([state[:8], np.array([0.0 if part is None else float(part) for part in (*start, *path)])])
 

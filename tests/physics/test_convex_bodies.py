@@ -86,7 +86,7 @@ def test_rates_of_energy_and_jellett_at_random_states(law, tilt):
     lever = scene.body.meridian.at(e[2])
     torque = jnp.stack([jnp.zeros(200) if part is None else part for part in motion.friction.torque])
     r = jnp.stack(lever.contact(tuple(e)))
-    expected = -lever.growth * rates[4] * (motion.spin_momentum - e[2] * L[2])
+    expected = -lever.growth * rates[4] * (scene.body.I3 * motion.spin - e[2] * L[2])
     expected -= motion.normal_force * jnp.sum(torque * r, axis=0)
     rate = jax.jvp(scene.jellett, (states,), (rates,))[1]
     size = float(scene.body.size * scene.body.I3) * 1e4

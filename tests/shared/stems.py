@@ -4,6 +4,7 @@ import math
 
 import tippe
 from nonholonomic.geometry import dot
+from tippe.modes.impact import FreeBody, as_free_body, balls
 
 
 def first_contact(body: tippe.Top) -> float:
@@ -18,3 +19,9 @@ def jellett(ball, free):
     """Jellett's quantity L.(R n - a e) [kg m^3/s] for one of the spheres: constant while no force acts on the other
     sphere."""
     return ball.radius * free.momentum[2] - ball.offset * dot(free.axis, free.momentum)
+
+
+def free_body(ride: tippe.HybridTrajectory) -> FreeBody:
+    """The top of a run as a free body, also in contact."""
+    free, (distance, rate) = as_free_body(ride.scene.body, balls(ride.scene.body)[0], ride.states), ride.above
+    return free._replace(velocity=(*free.velocity[:2], free.velocity[2] + rate), height=free.height + distance)

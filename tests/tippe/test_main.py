@@ -14,8 +14,8 @@ import tippe
 from nonholonomic.views import NO_VIEW
 from tippe import __main__ as job
 from tippe.__main__ import main
+from tippe.modes.problems import INVERTED
 from tippe.paper import drawn, parser
-from tippe.runs.launches import INVERTED
 from tippe.runs.view import theta_over_time
 
 SMALL = ["--paper", "--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]

@@ -16,6 +16,7 @@ from nonholonomic.compilation.xla_cpu import least, stored, stored_with_tangents
 from nonholonomic.geometry import (
     AbstractFrame,
     Component,
+    FrameMotion,
     PlaneFrame,
     Tangent,
     Vector,
@@ -86,7 +87,7 @@ def inclination(axis: Vector) -> Float[Array, "..."]:
 
 def angular_velocity(body: AbstractBody, axis: Vector, momentum: Vector) -> Vector:
     """w = L / I1 + (1 / I3 - 1 / I1) (L.e) e [rad/s]."""
-    factor = (1.0 / body.I3 - 1.0 / body.I1) * dot(momentum, axis)
+    factor = multiply(1.0 / body.I3 - 1.0 / body.I1, dot(momentum, axis))
     return sum_vectors(scale(1.0 / body.I1, momentum), scale(factor, axis))
 
 
@@ -118,7 +119,7 @@ class Motion(NamedTuple):
 
     `painleve_factor` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and 0
     if friction pulls the top down as strongly as N pushes it up. `velocity` is that of the point with which the frame
-    moves. `room` is positive where the ball fits, `None` if it fits everywhere.
+    moves, and `spin` the angular velocity about the axis. `room` is positive where the ball fits, `None` if it fits everywhere.
     """
 
     rate: tuple[Component, ...]
@@ -127,7 +128,7 @@ class Motion(NamedTuple):
     slip: Slip
     velocity: Tangent
     frame_rate: Tangent
-    spin_momentum: Float[Array, "..."]
+    spin: Float[Array, "..."]
     painleve_factor: Float[Array, "..."]
     room: Component
 
@@ -186,7 +187,7 @@ class AbstractContactDynamics(AbstractDynamics):
     """Equations of motion of a body on a single contact, which ends as one of `LOSSES`."""
 
     @abc.abstractmethod
-    def rotation(self, state: States) -> tuple[Vector, Vector]:
+    def rotation(self, state: Components) -> tuple[Vector, Vector]:
         """Angular velocity of the body [rad/s], and the vector r from its centre of mass to the contact [m], in the
         moving frame."""
 
@@ -214,6 +215,35 @@ class AbstractContactDynamics(AbstractDynamics):
         return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
 
 
+class Rolled(NamedTuple):
+    """How a body that rolls moves over the arena, with all vectors in the moving frame.
+
+    - `angular_velocity`: w [rad/s]; `lever`, `lever_rate`: the vector r from the centre of mass to the contact [m], and its
+      rate as a vector, not of its components.
+    - `velocity`: as in `Motion`; `frame`: the motion of the frame.
+    """
+
+    angular_velocity: Vector
+    lever: Vector
+    lever_rate: Vector
+    velocity: Tangent
+    frame: FrameMotion
+
+
+def carried_rates(
+    frame: FrameMotion, gravity: Float[Array, "..."], push: Vector, rise: Component, *turning: tuple[Vector, Vector]
+) -> tuple[Component, ...]:
+    """Rate of change of a state's components, in the frame that moves with the contact.
+
+    **Arguments:** `push`: force along the arena, over the mass [m/s^2]; `rise`: velocity of the centre of mass along n
+    [m/s]; `turning`: the axis, the angular momentum and, for a body of any inertia, its x axis, each with its rate.
+    """
+    o, up, place_rate, _, _ = frame
+    u_dot = [add(push[k], multiply(-gravity, up[k]), multiply(o[k], rise)) for k in (0, 1)]
+    e_dot, L_dot, *x_dot = [sum_vectors(rate, rate_in_frame(vector, o)) for vector, rate in turning]
+    return (*u_dot, *e_dot, *L_dot, *place_rate, *(x_dot[0] if x_dot else ()))
+
+
 class AbstractRollingDynamics(AbstractContactDynamics):
     """Equations of motion of a body whose contact point is at rest on the arena.
 
@@ -223,11 +253,35 @@ class AbstractRollingDynamics(AbstractContactDynamics):
     """
 
     body: eqx.AbstractVar[Any]
+    gravity: eqx.AbstractVar[Float[Array, "..."]]
+
+    @property
+    def weight(self) -> Float[Array, "..."]:
+        return self.body.mass * self.gravity
 
     @abc.abstractmethod
+    def rolled(self, state: Components) -> "Rolled":
+        """How a body that rolls moves over the arena."""
+
     def evaluate(self, state: Components) -> tuple[Motion, Vector]:
-        """The motion, whose `friction` is the force along the arena per unit normal force; and the force of the arena on
-        the body [N] in the moving frame: the components along the arena, and the normal force."""
+        """The motion, whose `friction` is the force along the arena per unit normal force; and the force F of the arena on
+        the body [N] in the moving frame: the components along the arena, and the normal force.
+
+        With the velocity r x w of the centre of mass and r' the rate of r as a vector,
+        (J + m (r^2 - r r^T)) w' = L x w + m r x (r' x w + g z), and F = m (r' x w + r x w' + g z).
+        """
+        (w, r, r_dot, velocity, frame), (_, e, L, place), m = self.rolled(state), parts(state), self.body.mass
+        steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, frame.vertical))
+        torque = sum_vectors(cross(L, w), scale(m, cross(r, steady_push)))
+        push = sum_vectors(steady_push, cross(r, self.over_inertia(state, r, torque)))
+        F = scale(m, push)
+        turning = [(e, cross(w, e)), (L, cross(r, F))]
+        if x_axis := place[len(frame.place_rate) :]:
+            turning.append((x_axis, cross(w, x_axis)))
+        rate = carried_rates(frame, self.gravity, push, cross(r, w)[2], *turning)
+        zero = jnp.zeros_like(F[2])
+        load, slip = ContactLoad((F[0] / F[2], F[1] / F[2])), Slip(zero, zero, (w[0], w[1], None))
+        return Motion(rate, F[2], load, slip, velocity, frame.frame_rate, dot(w, e), 1.0 + zero, frame.room), F
 
     def motion(self, state: Components) -> Motion:
         return self.evaluate(state)[0]
@@ -323,30 +377,11 @@ class Dynamics(AbstractContactDynamics):
     axial_excess: Float[Array, "..."]
     turns: Float[Array, "..."] | None = None
 
-    @classmethod
-    def of(
-        cls, body: AbstractBody, frame: AbstractFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
-    ) -> "Dynamics":
-        """The equations for a body on an arena.
-
-        **Arguments:** `frame`: the frame of the body on the arena; the others as for `Scene`.
-        """
-        return cls(
-            frame=frame,
-            friction=friction,
-            meridian=body.meridian,
-            mass=body.mass,
-            gravity=gravity,
-            per_mass=1.0 / body.mass,
-            per_transverse=1.0 / body.I1,
-            axial_excess=1.0 / body.I3 - 1.0 / body.I1,
-        )
-
     @property
     def weight(self) -> Float[Array, "..."]:
         return self.mass * self.gravity
 
-    def rotation(self, state: States) -> tuple[Vector, Vector]:
+    def rotation(self, state: Components) -> tuple[Vector, Vector]:
         _, e, L, _ = parts(state)
         w = sum_vectors(scale(self.per_transverse, L), scale(self.axial_excess * dot(L, e), e))
         return w, self.meridian.at(e[2]).contact(e)
@@ -377,7 +412,8 @@ class Dynamics(AbstractContactDynamics):
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
         changing = multiply(growth, e_dot[2])
         path = (add(V[0], multiply(changing, e[0])), add(V[1], multiply(changing, e[1])))
-        o, up, place_rate, room, _ = self.frame.frame_motion(place, path)
+        frame = self.frame.frame_motion(place, path)
+        o, up, _, room, _ = frame
 
         spin_momentum = dot(L, e)
         along_axis = self.axial_excess * spin_momentum
@@ -408,17 +444,14 @@ class Dynamics(AbstractContactDynamics):
         N = load / painleve_factor
 
         thrust = N * self.per_mass
-        u3 = multiply(-a, e_dot[2]) if o != (None, None) else None
-        u1_dot = add(multiply(thrust, f1), multiply(-self.gravity, up[0]), multiply(o[0], u3))
-        u2_dot = add(multiply(thrust, f2), multiply(-self.gravity, up[1]), multiply(o[1], u3))
-        e_dot = sum_vectors(e_dot, rate_in_frame(e, o))
-        L_dot = sum_vectors(scale(N, (M1, M2, M3)), rate_in_frame(L, o))
+        push, rise = (multiply(thrust, f1), multiply(thrust, f2)), multiply(-a, e_dot[2])
+        rate = carried_rates(frame, self.gravity, push, rise, (e, e_dot), (L, scale(N, (M1, M2, M3))))
         if self.turns is not None:
             turn = self.turns * self.per_transverse * L[2]
-            u1_dot, u2_dot = add(u1_dot, turn * u2), subtract(u2_dot, turn * u1)
-            e_dot, L_dot = sum_vectors(e_dot, turned(e, turn)), sum_vectors(L_dot, turned(L, turn))
-        rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
-        return Motion(rate, N, friction, slip, path, o, spin_momentum, painleve_factor, room)
+            u_turn, e_turn, L_turn = [turned(vector, turn) for vector in ((u1, u2), e, L)]
+            rate = sum_vectors(rate, (*u_turn[:2], *e_turn, *L_turn, *[None] * len(place)))
+        spin = (self.per_transverse + self.axial_excess) * spin_momentum
+        return Motion(rate, N, friction, slip, path, o, spin, painleve_factor, room)
 
 
 def turned(vector: Vector, rate: Float[Array, "..."]) -> Vector:
@@ -437,47 +470,17 @@ class RollingDynamics(AbstractRollingDynamics):
     body: Top
     gravity: Float[Array, "..."]
 
-    @property
-    def weight(self) -> Float[Array, "..."]:
-        return self.body.mass * self.gravity
-
-    def rotation(self, state: States) -> tuple[Vector, Vector]:
+    def rotation(self, state: Components) -> tuple[Vector, Vector]:
         _, e, L, _ = parts(state)
         return angular_velocity(self.body, e, L), self.body.meridian.contact(e)
 
-    def evaluate(self, state: Components) -> tuple[Motion, Vector]:
-        """The motion and the reaction F.
-
-        (J + m (r^2 - r r^T)) w' = -w x L + m r x (r' x w) + m g r x z, with r' = a e' - R n'; then u' = r' x w + r x w',
-        F = m (u' + g z), and L' = r x F.
-        """
-        _, e, L, place = parts(state)
-        R, a, m = self.body.radius, self.body.offset, self.body.mass
-
-        w = angular_velocity(self.body, e, L)
-        e_dot = cross(w, e)
+    def rolled(self, state: Components) -> Rolled:
+        (w, r), (_, e, _, place), R = self.rotation(state), parts(state), self.body.radius
         V: Tangent = (R * w[1], -R * w[0])
-        o, up, place_rate, room, _ = self.frame.frame_motion(place, V)
-        r = self.body.meridian.contact(e)
-        # n' = -(o1 t1 + o2 t2), and r' as a vector, not as the rate of its components.
-        r_dot = sum_vectors(scale(a, e_dot), scale(R, (*o, None)))
-        u = cross(r, w)
-
-        steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, up))
-        torque = sum_vectors(scale(m, cross(r, steady_push)), cross(L, w))
-        w_dot = self.over_inertia(state, r, torque)
-        push = sum_vectors(steady_push, cross(r, w_dot))
-
-        u1_dot = add(push[0], multiply(-self.gravity, up[0]), multiply(o[0], u[2]))
-        u2_dot = add(push[1], multiply(-self.gravity, up[1]), multiply(o[1], u[2]))
-        F = scale(m, push)
-        e_dot = sum_vectors(e_dot, rate_in_frame(e, o))
-        L_dot = sum_vectors(cross(r, F), rate_in_frame(L, o))
-        rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
-        zero = jnp.zeros_like(F[2])
-        load = ContactLoad((F[0] / F[2], F[1] / F[2]))
-        slip = Slip(zero, zero, (w[0], w[1], None))
-        return Motion(rate, F[2], load, slip, V, o, dot(L, e), 1.0 + zero, room), F
+        frame = self.frame.frame_motion(place, V)
+        # r = a e - R n, and n' = -(o1 t1 + o2 t2).
+        r_dot = sum_vectors(scale(self.body.offset, cross(w, e)), scale(R, (*frame.frame_rate, None)))
+        return Rolled(w, r, r_dot, V, frame)
 
     def momentum(self, state: States, w: Vector) -> Vector:
         e = parts(state).axis

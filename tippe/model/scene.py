@@ -1,6 +1,7 @@
 """The scene, with its body, arena, friction and gravity; and the launches that start runs in it."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator
 from typing import Any, ClassVar, Generic, TypeVar
@@ -161,9 +162,8 @@ class Launch(Bounded):
         )
 
     def bounds(self) -> Iterator[Bound]:
-        yield from super().bounds()
-        if self.place is not None:
-            yield Bound(self.eta, "eta", at_least=0.0, at_most=0.0, why="place is given")
+        no_eta = Bound(self.eta, "eta", at_least=0.0, at_most=0.0, why="place is given")
+        return itertools.chain(super().bounds(), [] if self.place is None else [no_eta])
 
 
 def as_launch(value: Any) -> Any:
@@ -287,8 +287,7 @@ class Scene(Bounded, Generic[Body]):
             )
 
     def bounds(self) -> Iterator[Bound]:
-        yield from super().bounds()
-        surface = self.surface
+        surface, own = self.surface, []
         if isinstance(surface, Cylinder | Sphere | Torus) and surface.sign(self.side, "inside") < 0.0:
             # The radius that the arena must exceed so that the body fits inside.
             room = self.body.size
@@ -296,7 +295,8 @@ class Scene(Bounded, Generic[Body]):
                 lowest, highest = self.body.half_widths
                 room = highest if isinstance(surface, Sphere) else lowest
             name = "tube" if isinstance(surface, Torus) else "radius"
-            yield Bound(getattr(surface, name), f"surface {name}", above=room, why="the body must fit inside")
+            own.append(Bound(getattr(surface, name), f"surface {name}", above=room, why="the body must fit inside"))
+        return itertools.chain(super().bounds(), own)
 
     def suspicion(self) -> str | None:
         for name, value in numbers("surface", self.surface, functions=False).items():
@@ -309,11 +309,13 @@ class Scene(Bounded, Generic[Body]):
     @property
     def frame(self) -> AbstractFrame:
         """The moving frame of the body on the arena; that of an `Ellipsoid` or a `RigidBody` moves with the contact point."""
-        distance = jnp.zeros(()) if isinstance(self.body, AbstractRigidBody) else self.body.size
-        side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.size)
+        size, is_integrated = self.body.size, self.contact == "hybrid" and not self.flies_in_closed_form
+        distance = jnp.zeros(()) if isinstance(self.body, AbstractRigidBody) else size
+        if self.level and not is_integrated:
+            return PlaneFrame(distance)
         # A flight can take the top anywhere, so it needs the frame that stores its position.
-        flies = self.contact == "hybrid" and not self.flies_in_closed_form
-        return frame_of(self.surface, side, distance, pull, carried=flies)
+        side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / size)
+        return frame_of(self.surface, side, distance, pull, carried=is_integrated)
 
     @property
     def has_stem(self) -> bool:
@@ -327,9 +329,8 @@ class Scene(Bounded, Generic[Body]):
 
     @property
     def flies_in_closed_form(self) -> bool:
-        """Whether flights of a hybrid scene need no integration: above a level plane, under a law with a single
-        mode."""
-        return self.level and not self.friction.set_valued
+        """Whether there are flights that need no integration: above a level plane, under a law with a single mode."""
+        return self.contact == "hybrid" and self.level and not self.friction.set_valued
 
     @property
     def dynamics(self) -> Any:
@@ -343,7 +344,9 @@ class Scene(Bounded, Generic[Body]):
                 return rolling
             slipping = RigidSlipping(**parts_of_scene, friction=friction, per_mass=1.0 / body.mass)
             return StickSlip(slipping, rolling, friction.mu) if isinstance(friction, SetValuedCoulomb) else slipping
-        slipping = Dynamics.of(body, frame, friction, gravity)
+        per_mass, per_transverse, axial_excess = 1.0 / body.mass, 1.0 / body.I1, 1.0 / body.I3 - 1.0 / body.I1
+        parts_of_body = (body.mass, gravity, per_mass, per_transverse, axial_excess)
+        slipping = Dynamics(frame, friction, body.meridian, *parts_of_body)
         if not isinstance(friction, SetValuedCoulomb):
             return slipping
         assert isinstance(body, Top)
@@ -445,14 +448,15 @@ class Scene(Bounded, Generic[Body]):
         """
         launch = as_launch(launch)
         one = jnp.ones_like(launch.theta)
-        rate = jnp.sqrt(self.gravity / self.body.size)
-        velocity = rate * self.body.size
+        size = self.body.size
+        rate = jnp.sqrt(self.gravity / size)
+        velocity = rate * size
         I1, I3 = self.body.moments
         momentum = jnp.maximum(I3 * jnp.abs(launch.spin), I1 * rate)
         if launch.angular_velocity is not None:
             w = launch.angular_velocity
             momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(w, w)))
-        place = scale(one, self.frame.place_scales(self.body.size))
+        place = scale(one, self.frame.place_scales(size))
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
@@ -487,13 +491,8 @@ class Scene(Bounded, Generic[Body]):
         # The contact point has no velocity along the normal.
         u3 = cross(r, w)[2]
         frame, place = dynamics.frame, place[: len(dynamics.frame.lengths)]
-        height = frame.height(place) + dot(self._mass_from_frame(r), frame.vertical(place))
+        height = frame.height(place) + dot(_mass_from_frame(frame, r), frame.vertical(place))
         return mass * (0.5 * (u1**2 + u2**2 + u3**2) + self.gravity * height) + 0.5 * dot(w, L)
-
-    def _mass_from_frame(self, lever: Vector) -> Vector:
-        """Vector from the point with which the frame moves to the centre of mass [m], given the vector from there to the
-        contact."""
-        return (-lever[0], -lever[1], -lever[2] - self.frame.distance)
 
     def jellett(self, state: States) -> Float[Array, "..."]:
         """Jellett's quantity L.(R n - a e) [kg m^3/s]: for a sphere on the plane, constant under every friction at the
@@ -523,8 +522,16 @@ class Scene(Bounded, Generic[Body]):
         """Vector from the point with which the frame moves to the point whose path is reported [m], in the moving
         frame."""
         # The path of a top is that of its sphere's centre, with which the frame moves.
-        is_top = isinstance(self.body, Top)
-        return (None, None, None) if is_top else self._mass_from_frame(self.dynamics.rotation(state)[1])
+        if isinstance(self.body, Top):
+            return (None, None, None)
+        dynamics = self.dynamics
+        return _mass_from_frame(dynamics.frame, dynamics.rotation(state)[1])
+
+
+def _mass_from_frame(frame: AbstractFrame, lever: Vector) -> Vector:
+    """Vector from the point with which the frame moves to the centre of mass [m], given the vector from there to the
+    contact."""
+    return (-lever[0], -lever[1], -lever[2] - frame.distance)
 
 
 def generic_direction(scene: Scene, launch: Launch, cells: int) -> States:

@@ -344,7 +344,7 @@ class StickSlip(AbstractContactDynamics):
         """Whether the contact is at rest."""
         return self.slip_speed(state) <= AT_REST * self.speed
 
-    def rotation(self, state: States) -> tuple[Vector, Vector]:
+    def rotation(self, state: Components) -> tuple[Vector, Vector]:
         return self.slipping.rotation(state)
 
     def stopped(self, state: States) -> States:

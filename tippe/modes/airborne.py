@@ -313,7 +313,7 @@ class ArenaSlide(AbstractFlyingMode):
         if other_ball is not None:
             spheres = {"contact_ball": contact_ball, "other_ball": other_ball, "on_stem": self.number == 1}
             problem = OneOfTwo(*contact, flies=True, stem_counts=self.stem_counts, scene=self.scene, **spheres)
-        return self.extended(problem, Quadratures.of(self.scene.body), state)
+        return self.extended(problem, Quadratures(), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         contact_ball, other_ball = own_and_other(self.scene.body, self.number)
@@ -441,7 +441,7 @@ def _at_other(
 
 
 def airborne_modes(
-    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
+    scene: Scene[Top], problem: InversionProblem, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `hopping_modes`.
 

@@ -152,7 +152,7 @@ def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float
     return body.mass * (0.5 * dot(free.velocity, free.velocity) + gravity * free.height) + rotation
 
 
-def energy_in(
+def energy_between(
     scene: Scene[Top], state: States, number: Int[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """The least and the greatest energy [J] that a state at the end of a mode, or of a flight from there, may have.
@@ -204,10 +204,10 @@ class Approach(NamedTuple):
 
 
 class ContactImpulse(NamedTuple):
-    """Impulses at the contact: of the force [N s], and of the torque [N m s], `None` under a law that has no torque."""
+    """Impulses at the contact: of the force [N s], and of the torque [N m s], which vanishes under a law without torque."""
 
     force: Vector
-    torque: Vector | None
+    torque: Vector = (None, None, None)
 
 
 class Impact(AbstractProblem):
@@ -233,17 +233,17 @@ class Impact(AbstractProblem):
         """The impulses at a stage of the impact."""
         unit = self.speed / self.approach.response[2][2]
         force = (state[0] * unit, state[1] * unit, normal * unit)
-        return ContactImpulse(force, tuple(row * unit * self.radius for row in state[2:]) or None)
+        return ContactImpulse(force, tuple(row * unit * self.radius for row in state[2:]) or (None, None, None))
 
     def changes(self, impulse: ContactImpulse) -> tuple[Vector, Vector]:
         """Changes of the velocity of the contact point [m/s] and of the angular velocity [rad/s] by an impulse."""
-        contact, torque = self.approach, cross(self.approach.arm, impulse.force)
-        velocity = tuple(dot(column, impulse.force) for column in contact.response)
-        if impulse.torque is not None:
-            angular_change = angular_velocity(self.body, contact.axis, impulse.torque)
-            velocity = sum_vectors(velocity, cross(angular_change, contact.arm))
-            torque = sum_vectors(torque, impulse.torque)
-        return velocity, angular_velocity(self.body, contact.axis, torque)
+        contact, (force, torque) = self.approach, impulse
+        angular_change = angular_velocity(self.body, contact.axis, torque)
+        velocity = sum_vectors(
+            tuple(dot(column, force) for column in contact.response), cross(angular_change, contact.arm)
+        )
+        whole_torque = sum_vectors(cross(contact.arm, force), torque)
+        return velocity, angular_velocity(self.body, contact.axis, whole_torque)
 
     def load(self, velocity: Vector, w: Vector) -> ContactLoad:
         """Friction force and torque per unit normal impulse."""
@@ -269,11 +269,12 @@ class Impact(AbstractProblem):
         # In compression, the sphere still approaches; in restitution, the margin is the dissipated energy that need not
         # be returned.
         approaches = -(self.approach.velocity[2] + change[2]) / self.speed
-        gain = dot(impulse.force, self.approach.velocity) + 0.5 * dot(impulse.force, change)
-        if impulse.torque is not None:
-            gain = (
-                gain + dot(impulse.torque, self.approach.angular_velocity) + 0.5 * dot(impulse.torque, angular_change)
-            )
+        gain = add(
+            dot(impulse.force, self.approach.velocity),
+            multiply(0.5, dot(impulse.force, change)),
+            dot(impulse.torque, self.approach.angular_velocity),
+            multiply(0.5, dot(impulse.torque, angular_change)),
+        )
         shortfall = -gain * response[2][2] / self.speed**2
         return least(missing, jnp.where(approaches > shortfall, approaches, shortfall))
 
@@ -337,9 +338,7 @@ def resolve_impact(
         outcome = _solved(impact, absolute=1.0)
         impulse, status = impact.ended(outcome.end_time, outcome.state), outcome.status
     velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, impulse.force))
-    momentum = sum_vectors(free.momentum, cross(contact.arm, impulse.force))
-    if impulse.torque is not None:
-        momentum = sum_vectors(momentum, impulse.torque)
+    momentum = sum_vectors(free.momentum, cross(contact.arm, impulse.force), impulse.torque)
     return FreeBody(velocity, free.height, free.axis, momentum), status != LEFT_DOMAIN
 
 
@@ -443,7 +442,7 @@ def _coulomb_impulse(impact: Impact, mu: Float[Array, "..."]) -> tuple[ContactIm
     impulse = impact.impulse(state[2], state[:2])
     remaining_impulse = _remaining_impulse(impact, mu, impulse.force)
     force = tuple(jnp.where(stops, a + b, a) for a, b in zip(impulse.force, remaining_impulse, strict=True))
-    return ContactImpulse(force, None), outcome.status
+    return ContactImpulse(force), outcome.status
 
 
 def _remaining_impulse(impact: Impact, mu: Float[Array, "..."], impulse: Vector) -> Vector:
@@ -548,14 +547,14 @@ class LeaningMotion(NamedTuple):
     """The equations of motion evaluated at one state: the rate of the state of `tippe/model/dynamics.py`, and both
     normal forces [N].
 
-    `friction_power` [W] is that of both contacts, `None` without friction; `definiteness` is m_1 - m_0 as a fraction of
-    its value without friction.
+    `friction_power` [W] is that of both contacts, `None` without friction; `spin`: as in `Motion`; `definiteness` is m_1 -
+    m_0 as a fraction of its value without friction.
     """
 
     rate: tuple[Component, ...]
     normal_forces: tuple[Float[Array, "..."], Float[Array, "..."]]
     friction_power: Component
-    spin_momentum: Float[Array, "..."]
+    spin: Float[Array, "..."]
     definiteness: Float[Array, "..."]
 
 
@@ -622,7 +621,7 @@ class LeaningDynamics(AbstractDynamics):
         rate = (*u_dot, *scale(precession, perpendicular), None, *L_dot, p_dot)
         power = dot(normal, tuple(load.power(slip) for load, slip in zip(loads, slips, strict=True)))
         stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)
-        return LeaningMotion(rate, normal, power, b, stiff)
+        return LeaningMotion(rate, normal, power, b / I3, stiff)
 
     def margins(self, state: States) -> tuple[Float[Array, "..."], ...]:
         """Both normal forces as fractions of the weight, plus `HOLDS`."""

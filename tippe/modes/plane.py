@@ -409,7 +409,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         if other_ball is not None:
             spheres = {"contact_ball": contact_ball, "other_ball": other_ball, "on_stem": self.number == 1}
             problem = SlidingOnOne(*contact, flies=True, stem_counts=self.stem_counts, **spheres)
-        return self.extended(problem, Quadratures.of(self.scene.body, of_mass=True), state)
+        return self.extended(problem, Quadratures(of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         contact_ball, _ = own_and_other(self.scene.body, self.number)
@@ -515,7 +515,7 @@ class Lean(AbstractFlyingMode):
         # that event has not.
         on_stem = jnp.asarray(not self.last)
         problem = InversionProblem(*contact, stem_counts=self.stem_counts, on_stem=on_stem, flies=True)
-        return self.extended(problem, Quadratures.of(self.scene.body, of_mass=True), state)
+        return self.extended(problem, Quadratures(of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         return shown(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
@@ -534,7 +534,7 @@ class Lean(AbstractFlyingMode):
 
 
 def hopping_modes(
-    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
+    scene: Scene[Top], problem: InversionProblem, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, sliding on each sphere and on both if there are two; and the index of the mode in which each
     starts.
@@ -543,8 +543,7 @@ def hopping_modes(
 
     - `scene`: a scene with `contact="hybrid"`; `problem`: the problem of its launches, which stand on their lower
       sphere.
-    - `tolerance`: unused by these modes; `last`: whether the last crossing counts; `with_quadratures`: as for
-      `AbstractFlyingMode`.
+    - `last`: whether the last crossing counts; `with_quadratures`: as for `AbstractFlyingMode`.
     """
     spheres, arguments = balls(scene.body), (scene, problem.scales, problem.cos_angle, with_quadratures)
     event = {"stem_counts": problem.stem_counts}

@@ -1,5 +1,6 @@
 """Motion on one smooth contact, as problems for the integrator, and the base of the modes with flights."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -10,10 +11,11 @@ from nonholonomic.compilation.xla_cpu import compiled_setup, least
 from nonholonomic.geometry import Component, Tangent, Vector, cross, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import AbstractBatchedMode
 from nonholonomic.integration import AbstractPassive, AbstractProblem, Components, ExtendedProblem, Lanes, States
+from nonholonomic.validation import as_number
 
-from ..model.body import AbstractBody, Top
+from ..model.body import Top
 from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Dynamics, parts
-from ..model.rigid import AbstractRigidBody, AbstractRigidDynamics
+from ..model.rigid import AbstractRigidDynamics
 from ..model.scene import Launch, Scene
 from ..model.stick_slip import StickSlip
 
@@ -22,6 +24,29 @@ from ..model.stick_slip import StickSlip
 
 class StemContact(eqx.Module):
     """The event that the stem of a top first carries it, in place of an angle that theta reaches."""
+
+
+#: The inclination [rad] at which a body without a stem counts as turned over.
+INVERTED = 0.95 * math.pi
+
+
+def event_of(scene: Scene, angle: Any) -> Float[Array, "..."] | StemContact:
+    """The event of a run: theta reaches the angle [rad]; or, without an angle, the top has turned over.
+
+    A top with a stem has turned over when its stem first carries it: when the stem bears a force or, as it lands, an
+    impulse. In flight nothing carries the top, whatever theta. No angle defines this event, because after a hop the stem
+    lands at a larger theta, and in a curved arena `Top.stem_angle` is not exactly the angle of the contact.
+    """
+    if angle is None and scene.has_stem:
+        return StemContact()
+    return as_number(INVERTED if angle is None else angle)
+
+
+def angle_of(scene: Scene, angle: Any) -> Float[Array, "..."]:
+    """The angle [rad] itself; or, without an angle, the inclination beyond which the top has turned over on a level
+    plane."""
+    event = event_of(scene, angle)
+    return scene.body.stem_angle if isinstance(event, StemContact) else event
 
 
 class InversionProblem(AbstractProblem):
@@ -112,18 +137,10 @@ class Quadratures(AbstractPassive):
     c is a unit vector across the axis that moves with the axis without rotation about it. The body's first axis is c
     turned about e by the spin angle, so every integrated component changes as slowly as the axis.
 
-    - `axial`: the moment of inertia about the axis [kg m^2].
     - `of_mass`: whether the path belongs to the centre of mass, along a level plane.
     """
 
-    axial: Float[Array, "..."]
     of_mass: bool = eqx.field(static=True, default=False)
-
-    @classmethod
-    def of(cls, body: AbstractBody | AbstractRigidBody, of_mass: bool = False) -> "Quadratures":
-        """The quadratures of a body."""
-        # The equations of a rigid body return the spin in place of the angular momentum about the axis.
-        return cls(jnp.ones(()) if isinstance(body, AbstractRigidBody) else body.I3, of_mass)
 
     def rates(
         self,
@@ -141,7 +158,7 @@ class Quadratures(AbstractPassive):
             axial_rate = dot(sum_vectors(motion.rate[2:5], scale(-1.0, rate_in_frame(e, frame_rate))), c)
         else:
             axial_rate = dot(cross(L, e), c) * dynamics.per_transverse
-        rates = (*path_rate, *c_rate(c, e, axial_rate, frame_rate), motion.spin_momentum / self.axial)
+        rates = (*path_rate, *c_rate(c, e, axial_rate, frame_rate), motion.spin)
         return stacked((*motion.rate, *rates, motion.friction_power), state)
 
 
@@ -165,7 +182,7 @@ def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) 
     if cells is not None:
         rows = tuple(jnp.broadcast_to(row.reshape(len(row), -1), (len(row), cells)) for row in rows)
     problem = InversionProblem(scene.dynamics, None, rows[0], rows[1])
-    return ExtendedProblem(problem, Quadratures.of(scene.body), rows[2], rows[3], ends_on_event=False)
+    return ExtendedProblem(problem, Quadratures(), rows[2], rows[3], ends_on_event=False)
 
 
 # Common base of all modes of runs with flights.

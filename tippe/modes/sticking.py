@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
@@ -18,28 +18,25 @@ from ..model.rigid import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.stick_slip import ContactMode, Onset, StickSlip
 from . import airborne
-from .impact import balls, gap_rate
+from .impact import balls, energy_between, gap_rate
 from .problems import InversionProblem, Quadratures
 
-# Runs with stick and slip: the cells of a table, and a single run with its path.
+# Runs with stick and slip: the cells of a table, and a single run with its path. With flights, the flight is as in
+# `airborne.py`, with its states and passive quadratures, over any arena, the level plane included.
 
-#: The numbers of the two modes.
+#: The numbers of the two modes without flights.
 SLIPPING, ROLLING = range(2)
 
-
-def contact_energy(scene: Scene[Top], state: States, number: Int[Array, " cells"]) -> tuple[Lanes, Lanes]:
-    """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
-    assert isinstance(scene.dynamics, StickSlip)
-    rolls = scene.dynamics.rolling.carried_along(state)
-    total = scene.energy(jnp.where(number == ROLLING, rolls, state))
-    return total, total
+#: The numbers of the same modes with flights; flying has the same number as in `airborne.py`.
+TOUCH_SLIPPING, TOUCH_ROLLING = airborne.SLIDING, 2
 
 
 class StickSlipMode(AbstractBatchedMode):
     """Slipping or rolling until theta reaches an angle; with `last`, the last crossing counts.
 
     The equations of motion have the first `size` components. For a single run whose path is kept, `passive` quadratures
-    follow. Without an angle, a run ends when the spin about the normal reverses; `spin` is the initial spin.
+    follow. Without an angle, a run ends when the spin about the normal reverses; `spin` is the initial spin. Where the
+    contact is lost, the top flies in a `scene` that is given; otherwise the run ends.
     """
 
     kind: ContactMode
@@ -50,23 +47,29 @@ class StickSlipMode(AbstractBatchedMode):
     size: int = eqx.field(static=True)
     passive: Quadratures | None = None
     spin: Float[Array, "..."] | None = None
+    scene: Scene[Top] | None = None
 
     def problem(self, state: States) -> AbstractProblem:
         return self._under(self.kind, state)
 
-    def shown(self, state: Float[Array, "components times"]) -> Float[Array, "components times"]:
-        return self.carried_along(state) if self.kind.rolls else state
+    def shown(self, state: Float[Array, "components times"]) -> Float[Array, "shown times"]:
+        return self._with_distance(self.carried_along(state) if self.kind.rolls else state)
+
+    def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
+        onset, wait = motion
+        return self._with_distance(onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0)))
+
+    def _with_distance(self, rows: Float[Array, "components times"]) -> Float[Array, "shown times"]:
+        """The output rows of states in contact: with flights, the distance from the arena and its rate are 0."""
+        return rows if self.scene is None else jnp.concatenate([rows, jnp.zeros_like(rows[:2])])
 
     def carried_along(self, state: States) -> States:
         """The state of a rolling top, whose velocity follows from the other components."""
         return jnp.concatenate([self.kind.rolling.carried_along(state[: self.size]), state[self.size :]])
 
-    def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "components times"]:
-        onset, wait = motion
-        return onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0))
-
     def reset_map(self, state: States, left: Lanes) -> Transition:
-        """Stick, slip, or end if the contact is lost. Counts the changes from slip to rolling."""
+        """Stick, slip, or fly where the contact is lost; without flights, the run ends there. Counts flights, and changes
+        from slip to rolling."""
         slipping = self._under(self.kind.slipping, state)
         change = self.kind.ended(state, self.size, lambda point: slipping.field(left, point), self.scales, left)
         onset, length = change.onset, change.onset.length
@@ -95,13 +98,26 @@ class StickSlipMode(AbstractBatchedMode):
             )
         status = jnp.where(change.elapsed >= left, REACHED_END, RUNNING)
         status = jnp.where(change.lost, LEFT_DOMAIN, jnp.where(ends, CROSSED, status))
+        state_after = jnp.where(is_beyond, state, jnp.where(ends, onset.at(fraction), change.state))
+        rolls = jnp.where(is_beyond | change.lost, self.kind.rolls, change.rolls)
+        mode, counts = (
+            jnp.where(rolls, ROLLING, SLIPPING),
+            [change.rolls & ~change.lost & ~is_beyond & (not self.kind.rolls)],
+        )
+        if self.scene is not None:
+            lost_state = self.carried_along(state_after) if self.kind.rolls else state_after
+            flies = (status == LEFT_DOMAIN) & (self.kind.loss(lost_state[: airborne.OWN]) == 0)
+            mode = jnp.where(flies, airborne.FLYING, jnp.where(rolls, TOUCH_ROLLING, TOUCH_SLIPPING))
+            flight = airborne.lift_off(self.scene, lost_state, self.passive is not None)
+            state_after, status = jnp.where(flies, flight, state_after), jnp.where(flies, RUNNING, status)
+            counts = [flies, *counts]
         return Transition(
-            mode=jnp.where(is_beyond | change.lost, int(self.kind.rolls), jnp.where(change.rolls, ROLLING, SLIPPING)),
-            state=jnp.where(is_beyond, state, jnp.where(ends, onset.at(fraction), change.state)),
+            mode=mode,
+            state=state_after,
             elapsed=jnp.where(ends, crossing, change.elapsed),
             status=status,
             crossing_time=jnp.where(crosses, crossing, jnp.inf),
-            counts=(change.rolls & ~change.lost & ~is_beyond & (not self.kind.rolls)).astype(int)[None],
+            counts=jnp.stack(counts).astype(int),
             record=record,
         )
 
@@ -120,67 +136,6 @@ class StickSlipMode(AbstractBatchedMode):
         return ExtendedProblem(problem, self.passive, state[size:], self.scales[size:], ends_on_event=False)
 
 
-def kinds_of(stick_slip: StickSlip, tolerance: float) -> tuple[ContactMode, ContactMode]:
-    """The two kinds of motion, slipping and rolling. **Arguments:** `tolerance`: as for `ContactMode`."""
-    laws = (stick_slip.slipping, stick_slip.rolling, stick_slip.mu, jnp.asarray(tolerance, float))
-    return ContactMode(*laws, rolls=False), ContactMode(*laws, rolls=True)
-
-
-def stick_slip_modes(
-    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
-) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `hopping_modes`."""
-    stick_slip, passive = problem.dynamics, Quadratures.of(scene.body) if with_quadratures else None
-    assert isinstance(stick_slip, StickSlip)
-    x_axis = 3 * isinstance(scene.body, AbstractRigidBody)
-    size = PLACE.start + len(stick_slip.frame.place_scales(1.0)) + x_axis
-    options = (problem.cos_angle, problem.scales, last, size, passive, problem.spin)
-    both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds_of(stick_slip, tolerance))
-    return both_modes, _first_mode(stick_slip, problem.states, size)
-
-
-@compiled_setup
-def _first_mode(stick_slip: StickSlip, states: States, size: int) -> Int[Array, " cells"]:
-    """The index of the mode in which each cell starts."""
-    return jnp.where(stick_slip.rests(states[:size]), ROLLING, SLIPPING)
-
-
-# Slipping, rolling and flying over any arena, the level plane included, under set-valued Coulomb friction.
-#
-# With flights: slipping and rolling are as above, flight as in `airborne.py`, with the states and passive quadratures of
-# `airborne.py`.
-
-#: The numbers of the modes; flying has the same number as in `airborne.py`.
-TOUCH_SLIPPING, TOUCH_ROLLING = airborne.SLIDING, 2
-
-
-class Touch(StickSlipMode):
-    """Slipping or rolling on the arena, until the contact is lost."""
-
-    scene: Scene[Top] = eqx.field(kw_only=True)
-
-    def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
-        return _at_no_distance(super().shown(state))
-
-    def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "21 times"]:
-        return _at_no_distance(super().between(motion, passed))
-
-    def reset_map(self, state: States, left: Lanes) -> Transition:
-        """Stick, slip, or fly where the contact is lost. Counts flights, and changes from slip to rolling."""
-        transition = super().reset_map(state, left)
-        state_after = self.carried_along(transition.state) if self.kind.rolls else transition.state
-        flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(state_after[: airborne.OWN]) == 0)
-        mode = jnp.where(transition.mode == ROLLING, TOUCH_ROLLING, TOUCH_SLIPPING)
-        return transition._replace(
-            mode=jnp.where(flies, airborne.FLYING, mode),
-            state=jnp.where(
-                flies, airborne.lift_off(self.scene, state_after, self.passive is not None), transition.state
-            ),
-            status=jnp.where(flies, RUNNING, transition.status),
-            counts=jnp.concatenate([flies.astype(int)[None], transition.counts]),
-        )
-
-
 class Land(airborne.Fly):
     """Flying over the arena, to a contact that slips or rolls."""
 
@@ -195,34 +150,48 @@ class Land(airborne.Fly):
         )
 
 
-def airborne_stick_slip_modes(
-    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
+def stick_slip_modes(
+    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `hopping_modes`."""
-    stick_slip, passive = problem.dynamics, Quadratures.of(scene.body) if with_quadratures else None
+    """The modes of runs, and the index of the mode in which each starts. **Arguments:** `tolerance`: as for `ContactMode`;
+    the others as for `hopping_modes`."""
+    stick_slip, passive = problem.dynamics, Quadratures() if with_quadratures else None
     assert isinstance(stick_slip, StickSlip)
-    options = (problem.cos_angle, problem.scales, last, airborne.OWN, passive)
-    slips, rolls = (Touch(kind, *options, scene=scene) for kind in kinds_of(stick_slip, tolerance))
-    flies = Land(scene, problem.scales, problem.cos_angle, with_quadratures)
-    first = jnp.where(stick_slip.rests(problem.states[: airborne.OWN]), TOUCH_ROLLING, TOUCH_SLIPPING)
-    return (slips, flies, rolls), first
+    x_axis = 3 * isinstance(scene.body, AbstractRigidBody)
+    size, flies = PLACE.start + len(stick_slip.frame.lengths) + x_axis, scene.contact == "hybrid"
+    laws = (stick_slip.slipping, stick_slip.rolling, stick_slip.mu, jnp.asarray(tolerance, float))
+    options = (problem.cos_angle, problem.scales, last, size, passive, problem.spin, scene if flies else None)
+    slips, rolls = (StickSlipMode(ContactMode(*laws, rolls=rolls), *options) for rolls in (False, True))
+    rests = _rests(stick_slip, problem.states[:size])
+    if not flies:
+        return (slips, rolls), jnp.where(rests, ROLLING, SLIPPING)
+    land = Land(scene, problem.scales, problem.cos_angle, with_quadratures)
+    return (slips, land, rolls), jnp.where(rests, TOUCH_ROLLING, TOUCH_SLIPPING)
 
 
-def _at_no_distance(rows: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
-    """The output rows of states in contact."""
-    return jnp.concatenate([rows, jnp.zeros_like(rows[:2])])
+@compiled_setup
+def _rests(stick_slip: StickSlip, states: States) -> Bool[Array, " cells"]:
+    """Whether the contact of each cell is at rest."""
+    return stick_slip.rests(states)
 
 
 # Convert the final states of runs over any arena to states in contact, and compute their energy and why a contact
 # ended.
 
 
-def airborne_energy(scene: Scene[Top], state: States, mode: Int[Array, " cells"]) -> tuple[Lanes, Lanes]:
-    """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
-    state, distance, rate = above_the_ground(scene, state, mode)
-    if isinstance(scene.dynamics, StickSlip):
-        state = jnp.where(mode == TOUCH_ROLLING, scene.dynamics.rolling.carried_along(state), state)
-    total = scene.energy(state) + lifted(scene, state, distance, rate)
+def energy_in(scene: Scene, state: States, mode: Int[Array, " cells"]) -> tuple[Lanes, Lanes]:
+    """The least and the greatest energy [J] that a state at the end of a mode, or of a flight in closed form from there,
+    may have. **Arguments:** `mode`: the index of the mode."""
+    if scene.flies_in_closed_form:
+        return energy_between(scene, state, mode)
+    energy_above, flies = 0.0, scene.contact == "hybrid"
+    if flies:
+        state, distance, rate = above_the_ground(scene, state, mode)
+        energy_above = lifted(scene, state, distance, rate)
+    if scene.friction.set_valued:
+        rolls = mode == (TOUCH_ROLLING if flies else ROLLING)
+        state = jnp.where(rolls, scene.dynamics.rolling.carried_along(state), state)
+    total = scene.energy(state) + energy_above
     return total, total
 
 
@@ -256,10 +225,10 @@ def above_the_ground(
     return contact, jnp.where(flies, ground.gap, 0.0), jnp.where(flies, rate, 0.0)
 
 
-def loss(scene: Scene[Top], state: States) -> Int[Array, "..."]:
-    """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
-    dynamics, state = scene.dynamics, state[: airborne.OWN]
-    if scene.body.stem is None:
+def loss(scene: Scene, state: States) -> Int[Array, "..."]:
+    """Why a contact ended: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
+    dynamics = scene.dynamics
+    if not scene.has_stem:
         return dynamics.loss(state)
     # The domain margin of the touching sphere has vanished.
     stem = airborne.standing(scene, balls(scene.body)[1])

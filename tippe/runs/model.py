@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections import Counter
+from collections.abc import Collection
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,66 +24,33 @@ from nonholonomic.sweeps import Quantity, Variable
 from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
 
 from ..friction import NoSlip
+from ..model.body import Top
 from ..model.dynamics import LOSSES, NO_COSINE
 from ..model.scene import Launch, Scene, generic_direction
 from ..modes.airborne import airborne_modes
-from ..modes.impact import energy_in
 from ..modes.plane import hopping_modes
-from ..modes.problems import BEHIND_PATH, InversionProblem, StemContact, trajectory_problem
-from ..modes.sticking import (
-    above_the_ground,
-    airborne_energy,
-    airborne_stick_slip_modes,
-    contact_energy,
-    loss,
-    stick_slip_modes,
-)
-from .launches import INVERTED, NUMBERS_OF_A_LAUNCH, event_of, labels, variable_numbers
+from ..modes.problems import BEHIND_PATH, INVERTED, InversionProblem, StemContact, event_of, trajectory_problem
+from ..modes.sticking import above_the_ground, energy_in, loss, stick_slip_modes
 from .observables import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, AbstractTrajectory, allowance, quantities_of
-from .trajectory import ArenaTrajectory, HybridTrajectory, Trajectory, simulate_launch
-
-# The kinds of runs: one smooth motion, or several modes of contact and flight.
+from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
 
-class RunKind(NamedTuple):
-    """How to run a kind of scene: its counters besides steps, and its modes.
-
-    `modes` is a function of (scene, problem, tolerance, last) that returns the modes and the index of each cell's first
-    mode; `None` for smooth runs. `energy_in` is a function of (scene, state, mode) that returns the least and the
-    greatest energy [J] that the state may have. `loss` is a function of (scene, state) that returns how a run left its
-    domain, as a code in `LOSSES`; `None` for runs that can only jam, because they continue when contact is lost, and the
-    ball fits everywhere. `flight_state` is true if states in flight have another layout.
-    """
-
-    counts: tuple[str, ...]
-    modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
-    energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
-    loss: Callable[..., Int[Array, " cells"]] | None
-    flight_state: bool = False
-
-
-#: Descriptions of the counters of a run.
-COUNTED = {"hops": "flights", "sticks": "changes from slip to rolling"}
-
-
-# The state of one smooth motion has one energy.
-SMOOTH = RunKind(
-    (),
-    None,
-    energy_in=lambda scene, state, mode: (scene.energy(state),) * 2,
-    loss=lambda scene, state: scene.dynamics.loss(state),
-)
-STICK_SLIP = SMOOTH._replace(counts=("sticks",), modes=stick_slip_modes, energy_in=contact_energy)
-HYBRID = RunKind(("hops",), hopping_modes, energy_in, None)
-AIRBORNE = RunKind(("hops",), airborne_modes, airborne_energy, loss, True)
-STICK_SLIP_FLY = AIRBORNE._replace(counts=("hops", "sticks"), modes=airborne_stick_slip_modes)
+def modes_of(
+    scene: Scene, problem: InversionProblem, tolerance: Any, last: bool, with_quadratures: bool = False
+) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
+    """The modes of runs in a scene whose runs are not smooth, and the index of each cell's first mode. **Arguments:** as for
+    `stick_slip_modes`."""
+    if scene.friction.set_valued:
+        return stick_slip_modes(scene, problem, tolerance, last, with_quadratures)
+    modes = hopping_modes if scene.flies_in_closed_form else airborne_modes
+    return modes(scene, problem, last, with_quadratures)
 
 
 @compiled_setup
 def _start_with_path(scene: Scene, launch: Launch, cells: int) -> InversionProblem:
     """The launches of runs of several modes, with the passive quadratures: path, rotation and work."""
     state, scales = trajectory_problem((scene, launch), cells).start()
-    if scene.contact == "hybrid" and scene.flies_in_closed_form:
+    if scene.flies_in_closed_form:
         # The path is that of the centre of mass.
         place = state[8:10] - scene.body.offset * state[2:4]
         state = jnp.concatenate([state[:8], place, state[10:]])
@@ -97,6 +65,38 @@ def why_unresolved(smooth: bool) -> str:
     )
     reasons = "the model does not determine the motion from there on, or the mode changed too often, or"
     return grown if smooth else f"{reasons} {grown}; tippe.simulate states which"
+
+
+# The parameters that can be varied, and the names of the axes along them.
+
+UNITS = Top.units | Scene.units | Launch.units
+
+#: Descriptions of the axes.
+LONG_NAMES = {"theta": "θ(0)", "eta": "η(0)", "azimuth": "φ(0)", "spin": "spin ω₃(0)", "mu": "friction μ"}
+LONG_NAMES |= {"mass": "mass m", "radius": "radius", "offset": "offset a", "equatorial": "equatorial half axis b"}
+LONG_NAMES |= {"polar": "polar half axis p", "I1": "moment of inertia I₁", "I3": "moment of inertia I₃"}
+LONG_NAMES |= {"gravity": "gravity g", "slip_speed": "slip speed", "restitution": "restitution e_N"}
+
+#: The parts of a launch that consist of several numbers: the name of an axis along each number, and its unit.
+SEVERAL = {
+    "velocity": [(f"velocity_{axis}", "m s-1") for axis in ("t1", "t2")],
+    "angular_velocity": [(f"angular_velocity_{axis}", "rad s-1") for axis in ("t1", "t2", "n")],
+}
+
+#: Parameters of a launch that can be varied.
+NUMBERS_OF_A_LAUNCH = [f"launch.{name}" for name in ("theta", "spin", "eta", "azimuth")]
+NUMBERS_OF_A_LAUNCH += [
+    f"launch.{name}[{k}]"
+    for name, count in (("place", 3), ("velocity", 2), ("angular_velocity", 3))
+    for k in range(count)
+]
+
+
+def variable_numbers(scene: Scene) -> list[str]:
+    """The full names of a scene's parameters that can be varied: single numbers, including omitted ones, which are
+    0."""
+    names = [name for name, value in numbers("scene", scene).items() if np.ndim(value) == 0]
+    return [name for name in names if name != "scene.restitution" or scene.contact == "hybrid"]
 
 
 # The top as a model.
@@ -178,9 +178,33 @@ class TopModel(AbstractSceneModel):
         present = numbers("launch", self.launch)
         return [*variable_numbers(self.scene), *(name for name in NUMBERS_OF_A_LAUNCH if name in present)]
 
-    def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
-        taken = (*self.quantities, "time", "status", "end_time", *self.ends, *self.counters, "steps", "rejected")
-        return labels(self.scene, self.launch, names, taken)
+    def label(self, names: list[str], taken: Collection[str] | None = None) -> dict[str, tuple[str, str, str]]:
+        """The name of an axis is the last part of the full name, or the full name if another of the `names` has the same last
+        part or if it is `taken`, by default by a variable of a table."""
+        scene, launch = self.scene, self.launch
+        if taken is None:
+            taken = (*self.quantities, "time", "status", "end_time", *self.ends, *self.counters, "steps", "rejected")
+        coordinates = list(scene.surface.coordinates)
+        if "launch.place[2]" in numbers("launch", launch) and len(coordinates) == 2:
+            coordinates = [("x", "m"), ("y", "m"), ("z", "m")]
+        components = {
+            f"launch.{name}[{k}]": label
+            for name, parts in {"place": coordinates, **SEVERAL}.items()
+            for k, label in enumerate(parts)
+        }
+        units = UNITS | scene.body.units | scene.friction.units
+        shorts = {name: name.rsplit(".", 1)[-1] for name in names}
+        shorts |= {name: label for name, (label, _) in components.items() if name in shorts}
+        # `place` replaces the argument `eta`.
+        counts = Counter(short for name, short in shorts.items() if name != "launch.eta" or launch.place is None)
+        return {
+            name: (
+                short if counts[short] == 1 and short not in taken else name,
+                components[name][1] if name in components else units.get(short, "1"),
+                LONG_NAMES.get(short, short),
+            )
+            for name, short in shorts.items()
+        }
 
     def description(self) -> dict[str, Any]:
         request = {path: value for name, root in self.roots.items() for path, value in description(name, root).items()}
@@ -198,18 +222,8 @@ class TopModel(AbstractSceneModel):
         return is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if self.reverses else is_legal
 
     @property
-    def kind(self) -> RunKind:
-        """The kind of runs."""
-        hybrid = self.scene.contact == "hybrid"
-        if self.scene.friction.set_valued:
-            return STICK_SLIP_FLY if hybrid else STICK_SLIP
-        if not hybrid:
-            return SMOOTH
-        return HYBRID if self.scene.flies_in_closed_form else AIRBORNE
-
-    @property
     def smooth(self) -> bool:
-        return self.kind.modes is None
+        return self.scene.contact == "stop" and not self.scene.friction.set_valued
 
     @property
     def fit_slopes(self) -> str:
@@ -222,7 +236,8 @@ class TopModel(AbstractSceneModel):
 
     @property
     def counters(self) -> dict[str, str]:
-        return {name: COUNTED[name] for name in self.kind.counts}
+        hops = {"hops": "flights"} if self.scene.contact == "hybrid" else {}
+        return hops | ({"sticks": "changes from slip to rolling"} if self.scene.friction.set_valued else {})
 
     def require_differentiable(self, nested: bool, continues: bool = False) -> None:
         if continues and isinstance(self.angle, StemContact):
@@ -242,19 +257,18 @@ class TopModel(AbstractSceneModel):
         on_stem = TopModel.timed(self.scene, self.launch, StemContact())
         return {"stem_time": ("time at which the stem first carries the top", on_stem)}
 
-    def _is_without_path(self, names: Names) -> bool:
-        """Whether runs need no path: they end on the event of the model itself, or nearby runs are compared."""
-        return (self.event is None and self.has_event and names == ()) or names == self.comparable
-
-    def _problem_without_path(self, cells: int, names: Names) -> InversionProblem:
-        """The motion of such runs; without an event if nearby runs are compared."""
-        problem = InversionProblem.of(self.scene, self.launch, INVERTED if names else self.angle, cells)
-        return dataclasses.replace(problem, cos_angle=jnp.asarray(NO_COSINE)) if names else problem
+    def _without_path(self, cells: int | None, names: Names) -> InversionProblem | None:
+        """The motion of runs that need no path, because nearby runs are compared, without an event, or because they end on
+        the event of the model itself; `None` for other runs."""
+        compares = names == self.comparable
+        if not compares and not (self.event is None and self.has_event and names == ()):
+            return None
+        assert cells is not None
+        problem = InversionProblem.of(self.scene, self.launch, INVERTED if compares else self.angle, cells)
+        return dataclasses.replace(problem, cos_angle=jnp.asarray(NO_COSINE)) if compares else problem
 
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
-        if self._is_without_path(names):
-            assert cells is not None
-            problem = self._problem_without_path(cells, names)
+        if (problem := self._without_path(cells, names)) is not None:
             # A turning frame turns by a different angle for each launch, and the difference would count as divergence.
             return dataclasses.replace(problem, dynamics=self.scene.dynamics) if names else problem
         scene, run = self.scene, trajectory_problem((self.scene, self.launch), cells)
@@ -271,13 +285,10 @@ class TopModel(AbstractSceneModel):
         return CoreProblem(run, len(run.start()[0]) - BEHIND_PATH if has_path else run.leading)
 
     def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
-        assert self.kind.modes is not None
-        if self._is_without_path(names):
-            problem = self._problem_without_path(cells, names)
-            return (*self.kind.modes(self.scene, problem, tolerance, continues), problem.states)
+        if (problem := self._without_path(cells, names)) is not None:
+            return (*modes_of(self.scene, problem, tolerance, continues), problem.states)
         problem = _start_with_path(self.scene, self.launch, cells)
-        modes = self.kind.modes(self.scene, problem, tolerance, last=False, with_quadratures=True)
-        return (*modes, problem.states)
+        return (*modes_of(self.scene, problem, tolerance, last=False, with_quadratures=True), problem.states)
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -304,29 +315,28 @@ class TopModel(AbstractSceneModel):
     @property
     def trajectories(self) -> type[AbstractTrajectory]:
         """The class of trajectories of the scene."""
-        if self.scene.contact != "hybrid":
-            return Trajectory
-        return HybridTrajectory if self.scene.flies_in_closed_form else ArenaTrajectory
+        return HybridTrajectory if self.scene.contact == "hybrid" else Trajectory
 
     def ended(self, outcome: Outcome | HybridOutcome, tolerance: Number) -> Int[Array, " cells"]:
-        scene, kind = self.scene, self.kind
+        scene = self.scene
         cells = outcome.status.shape[0]
         start = InversionProblem.of(scene, self.launch, None if self.reverses else INVERTED, cells)
-        first, mode = None, None
-        if isinstance(outcome, HybridOutcome) and kind.modes is not None:
-            first, mode = kind.modes(scene, start, tolerance, False)[1], outcome.mode
+        first = mode = jnp.zeros(cells, int)
+        if isinstance(outcome, HybridOutcome) and not self.smooth:
+            first, mode = modes_of(scene, start, tolerance, False)[1], outcome.mode
         state = jnp.asarray(outcome.state)[: len(start.states)]
-        energy_before = kind.energy_in(scene, start.states, first)[1]
-        energy_after = kind.energy_in(scene, state, mode)[0]
+        energy_before = energy_in(scene, start.states, first)[1]
+        energy_after = energy_in(scene, state, mode)[0]
         # Then the arena's heights, the law of friction or the integration is wrong. NaN counts as not grown.
         grown = (energy_after > energy_before + allowance(scene, energy_before, tolerance)) & (outcome.status != FAILED)
         codes = jnp.array([int(status) for status in LOSSES])
-        left_domain = Status.JAMMED if kind.loss is None else codes[kind.loss(scene, state)]
+        # On the level plane, a run continues where contact is lost, and the ball fits everywhere.
+        left_domain = Status.JAMMED if scene.flies_in_closed_form else codes[loss(scene, state)]
         return jnp.where(grown, int(Status.UNRESOLVED), statuses(outcome.status, left_domain))
 
     def at_end(self, outcome: Any, start: Float[Array, "components cells"]) -> dict[str, Array]:
         state = jnp.asarray(outcome.state)[: len(start)]
-        if self.kind.flight_state:
+        if self.scene.contact == "hybrid" and not self.scene.flies_in_closed_form:
             state = above_the_ground(self.scene, state, outcome.mode)[0]
         return {"end_theta": self.scene.theta(state)}
 
@@ -334,7 +344,7 @@ class TopModel(AbstractSceneModel):
 def _integrated(scene: Scene) -> Scene:
     """A scene whose flights, if any, are integrated. A flight in closed form can end only at an angle, not at another event
     or time interval."""
-    if scene.contact == "hybrid" and scene.flies_in_closed_form:
+    if scene.flies_in_closed_form:
         return eqx.tree_at(lambda scene: scene.surface, scene, Plane(NO_TILT))
     return scene
 

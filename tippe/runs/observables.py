@@ -27,8 +27,8 @@ from ..friction import Frictionless
 from ..model.body import AbstractBody, Top
 from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
+from ..modes.problems import INVERTED
 from ..steady import group
-from .launches import INVERTED
 
 # The quantities of a run of a tippe top, with units and names, and the table of a run.
 
@@ -147,6 +147,9 @@ class AbstractTrajectory(AbstractRun):
 
     #: Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` if the sphere touches at all times.
     above: ClassVar[tuple[Component, Component]] = (None, None)
+
+    #: Further lines of the text of a run.
+    notes: ClassVar[list[str]] = []
 
     #: Kinetic and potential energy [J], (times,); a property of every kind of run.
     energy: ClassVar[Float[Array, " times"]]
@@ -356,7 +359,18 @@ class AbstractTrajectory(AbstractRun):
             lines.append(f"  steps: {self.stats['accepted']} accepted, {self.stats['rejected']} rejected")
             lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")
             lines.append(f"  energy residual: {self.stats['energy_residual']:.1e} J of {float(self.energy[0]):.4g} J")
+        lines += self.notes
+        # A run made inside a transformation does not know the reason.
+        if isinstance(self.status, str) and word == Status.UNRESOLVED.word:
+            lines.append(f"  unresolved: {self.reason()}")
         return "\n".join(lines)
+
+    def reason(self) -> str:
+        """The reason for the status "unresolved"."""
+        energy = np.asarray(self.energy)
+        if (gain := energy[-1] - energy[0]) > self.stats["energy_residual"]:
+            return f"the energy has grown by {gain:.1e} J, although nothing drives the top"
+        return f"the energy residual of {self.stats['energy_residual']:.1e} J is beyond what the tolerance allows"
 
 
 # The check of the energy: without a drive, it never grows, and it decreases by the work of friction.
@@ -391,11 +405,3 @@ def audited(run: Run, path: DenseSolution | HybridPath, tolerance: Number, **mor
     balanced = residual <= limit and energy[-1] <= energy[0] + limit
     status = run.status if balanced or run.status == Status.FAILED.word else Status.UNRESOLVED.word
     return dataclasses.replace(run, stats=stats | more, status=status)
-
-
-def why_unbalanced(run: Any) -> str:
-    """The reason why such a run is "unresolved"."""
-    energy = np.asarray(run.energy)
-    if (gain := energy[-1] - energy[0]) > run.stats["energy_residual"]:
-        return f"the energy has grown by {gain:.1e} J, although nothing drives the top"
-    return f"the energy residual of {run.stats['energy_residual']:.1e} J is beyond what the tolerance allows"

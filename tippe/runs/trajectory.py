@@ -1,7 +1,7 @@
 """One run of a tippe top, with its path, in contact or through flights."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -46,10 +46,10 @@ from ..modes.airborne import (
     lift_off,
     standing,
 )
-from ..modes.impact import BOTH, TOUCHING, Ball, FreeBody, approach, as_free_body, balls, energy, standing_on
+from ..modes.impact import BOTH, TOUCHING, Ball, balls, standing_on
 from ..modes.plane import MOST_BOUNCES, height
 from ..modes.sticking import lifted
-from .observables import AbstractTrajectory, Values, audited, of_each_run, why_unbalanced
+from .observables import AbstractTrajectory, Values, audited, of_each_run
 
 
 class Trajectory(AbstractTrajectory):
@@ -128,16 +128,15 @@ class Trajectory(AbstractTrajectory):
         """Velocity of the contact point along the arena, in the moving frame [m/s]."""
         return self.scene.slip_velocity(self.states).T
 
-    def __str__(self) -> str:
-        unresolved = isinstance(self.status, str) and self.status == Status.UNRESOLVED.word
-        return super().__str__() + (f"\n  unresolved: {why_unbalanced(self)}" if unresolved else "")
-
     def with_rows(self, times: Float[np.ndarray, " times"], rows: Values, mode: Values | None) -> "Trajectory":
         parts = {"t": times, **self.parts_of(self.scene, rows, mode, len(self.start))}
         return dataclasses.replace(self, **dict(zip(parts, on_device(*parts.values()), strict=True)))
 
 
 # One run through contacts, flights and impacts, with its path.
+
+#: A sphere is at the arena if its distance is below this fraction of its radius, at the end of a run.
+NEAR = 1e-6
 
 
 class HybridTrajectory(AbstractTrajectory):
@@ -150,7 +149,9 @@ class HybridTrajectory(AbstractTrajectory):
       that the forces are not determined, or at rest on any other arena.
     - `contact`: the sphere that touches at each time: 0 for the top's sphere, 1 for the stem's, 2 for both, -1 for none.
       At the time of an impact, values are those before the impact.
-    - `distance`: distance of the top's own sphere from the plane [m], and its rate [m/s].
+    - `distance`: distance of the top's own sphere from the arena [m], and its rate [m/s].
+    - `theta`, `azimuth`, `slip`: over any arena, `theta` and `azimuth` refer to the frame at the foot, the point of the
+      arena nearest to the centre of the top's own sphere, and `slip` to that at the foot of the touching sphere.
     - `hops`: start and end [s] of each flight until `end_time`, one row per flight; a table counts only the flights
       before the inversion. When the speed of bounces has decreased to 1e-5 sqrt(g R), the top counts as in contact,
       although the remaining bounces would take e / (1 - e) times as long as the last one (restitution e).
@@ -181,17 +182,12 @@ class HybridTrajectory(AbstractTrajectory):
     contact: Any = None
     hops: Float[np.ndarray, "hops 2"] | None = None
 
-    #: The reason why the motion is undetermined after the end of the run.
-    where_the_model_ends: ClassVar[str] = (
-        "sphere and stem touch the plane together, and friction is so strong that the forces are not determined"
-    )
-
     unused = (*AbstractTrajectory.unused, "hops")
     by_time = (*AbstractTrajectory.by_time, "distance", "contact")
 
     @property
     def above(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, " times"]]:
-        """Distance of the top's own sphere from the plane [m] and its rate [m/s]."""
+        """Distance of the top's own sphere from the arena [m] and its rate [m/s]."""
         return self.distance[0], self.distance[1]
 
     @property
@@ -221,136 +217,28 @@ class HybridTrajectory(AbstractTrajectory):
         return float(min([*strokes, first]))
 
     @of_each_run
-    def _stem_gap(self) -> Any:
-        """Distance of the stem from the arena [m]."""
-        main, stem = balls(self.scene.body)
-        return self.above[0] + height(main, stem, self.states)
-
-    @property
-    def _free(self) -> FreeBody:
-        """The top as a free body, also in contact."""
-        body = self.scene.body
-        free = as_free_body(body, balls(body)[0], self.states)
-        (distance, rate), (u1, u2, u3) = self.above, free.velocity
-        return FreeBody((u1, u2, u3 + rate), free.height + distance, free.axis, free.momentum)
-
-    @property
-    def _ball(self) -> Ball:
-        """The touching sphere; in flight, and if both touch, the top's own."""
-        spheres = balls(self.scene.body)
-        pairs = zip(spheres[0], spheres[-1], strict=True)
-        return Ball(*(jnp.where(self.contact == 1, stem, main) for main, stem in pairs))
-
-    @of_each_run
-    def energy(self) -> Float[Array, " times"]:
-        """Kinetic energy plus weight times the height of the centre of mass [J]."""
-        return energy(self.scene.body, self.scene.gravity, self._free)
-
-    @of_each_run
-    def normal_force(self) -> Float[Array, " times"]:
-        """Normal force [N]; 0 in flight. If both spheres touch, this is the sum of both forces, the weight."""
-        motion = standing_on(self.scene.dynamics, self._ball).motion(self.states)
-        total_force = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
-        return jnp.where(self.contact < 0, 0.0, total_force)
-
-    @of_each_run
-    def slip(self) -> Float[Array, "times 2"]:
-        """Velocity along the plane of the lowest point of the sphere that touches [m/s]; of the top's own sphere in
-        flight and if both touch."""
-        return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
-
-    @classmethod
-    def parts_of(cls, scene: Scene, rows: Values, mode: Any, core: int) -> dict[str, Any]:
-        # The rows end with the distance and its rate.
-        parts = super().parts_of(scene, rows[:-2], mode, core)
-        return parts | {"distance": rows[-2:], "contact": cls.touching(scene, mode)}
-
-    @staticmethod
-    def touching(scene: Scene, numbers: Values) -> Values:
-        """The sphere that touches, for each mode index."""
-        return numbers
-
-    @property
-    def _whether_it_turned_over(self) -> str:
-        if not (self.scene.has_stem and np.isfinite(self.stem_time)):
-            return super()._whether_it_turned_over
-        again = ", and at the end its sphere touches again" if np.asarray(self.contact)[-1] in (0, 2) else ""
-        return f"turned over: the stem first carries it at {self.stem_time:.6g} s{again}"
-
-    def _reason(self) -> str:
-        """The reason for the status "unresolved"."""
-        assert self.hops is not None
-        contacts = sum(segment.number != BETWEEN for segment in self.dense.segments)
-        if self.dense.status != UNRESOLVED:
-            return why_unbalanced(self)
-        if len(self.hops) >= MOST_BOUNCES or contacts >= MOST_ROUNDS:
-            return "there were too many flights or changes of contact"
-        return self.where_the_model_ends
-
-    def __str__(self) -> str:
-        text = super().__str__()
-        # A run made inside a transformation does not know it.
-        if "impact_loss" not in self.stats:
-            hops = self.stats.get("hops")
-            return text if hops is None or is_traced(hops) or np.ndim(hops) else f"{text}\n  {int(hops)} flights"
-        assert self.hops is not None
-        text = f"{text}\n  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
-        return f"{text}\n  unresolved: {self._reason()}" if self.status == Status.UNRESOLVED.word else text
-
-
-# One run through contacts, flights and impacts, with its path, in scenes whose flights are integrated numerically.
-
-#: A sphere is at the arena if its distance is below this fraction of its radius, at the end of a run.
-NEAR = 1e-6
-
-
-class ArenaTrajectory(HybridTrajectory):
-    """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena
-    nearest to the centre of the top's own sphere, and `distance` is the distance of this sphere from the arena and its
-    rate. `slip` refers to the frame at the foot of the touching sphere."""
-
-    @of_each_run
-    def energy(self) -> Float[Array, " times"]:
-        """Kinetic energy plus weight times the height of the centre of mass [J]."""
-        return self.scene.energy(self.states) + lifted(self.scene, self.states, *self.above)
-
-    @of_each_run
     def theta_rate(self) -> Float[Array, " times"]:
         """Rate of change of theta [rad/s]."""
         dynamics = self.scene.dynamics
         # theta changes with velocities only, so rolling and slipping do not differ.
         dynamics = dynamics.slipping if isinstance(dynamics, StickSlip) else dynamics
-        # The frame moves with the centre of the top's sphere, also in flight.
-        frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
-        rates = dataclasses.replace(dynamics, frame=frame).field(self.states)
-        return jax.jvp(self.scene.theta, (self.states,), (rates,))[1]
+        if not self.scene.flies_in_closed_form:
+            # The frame moves with the centre of the top's sphere, also in flight.
+            frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
+            dynamics = dataclasses.replace(dynamics, frame=frame)
+        return jax.jvp(self.scene.theta, (self.states,), (dynamics.field(self.states),))[1]
 
     @of_each_run
-    def normal_force(self) -> Float[Array, " times"]:
-        """Normal force [N]; 0 in flight."""
-        force = self.scene.normal_force(self.states)
-        if self.scene.body.stem is not None:
-            force = jnp.where(self.contact == 1, self._on_stem.normal_force, force)
-        return jnp.where(self.contact < 0, 0.0, force)
-
-    @of_each_run
-    def slip(self) -> Float[Array, "times 2"]:
-        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's
-        sphere while it touches, otherwise of the top's own."""
-        slip = self.scene.slip_velocity(self.states)
-        if self.scene.body.stem is not None:
-            of_stem = self._on_stem.slip
-            slip = jnp.where(self.contact == 1, jnp.stack([of_stem.x, of_stem.y]), slip)
-        return slip.T
-
-    @of_each_run
-    def _stem_gap(self) -> Float[Array, " times"]:
+    def _stem_gap(self) -> Any:
         """Distance of the stem from the arena [m]."""
-        return below(self.scene, self._flying, balls(self.scene.body)[1]).gap
+        main, stem = balls(self.scene.body)
+        if self.scene.flies_in_closed_form:
+            return self.above[0] + height(main, stem, self.states)
+        return below(self.scene, self._flying, stem).gap
 
     @property
     def _flying(self) -> FlightState:
-        """The top as if in flight, also in contact."""
+        """The top over any arena as if in flight, also in contact."""
         scene, place, (distance, rate) = self.scene, parts(self.states).place, self.above
         main = balls(scene.body)[0]
         # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
@@ -362,29 +250,87 @@ class ArenaTrajectory(HybridTrajectory):
     def _on_stem(self) -> Motion:
         """The motion on the stem, at times at which the stem touches; the first tangent is the projection of the
         reported one."""
-        scene, flying, stem = self.scene, self._flying, balls(self.scene.body)[1]
+        scene, stem = self.scene, balls(self.scene.body)[1]
+        if scene.flies_in_closed_form:
+            return standing_on(scene.dynamics, stem).motion(self.states)
+        flying = self._flying
         ground = below(scene, flying, stem)
         ground = ground._replace(axes=carried_frame(scene).own_axes((*ground.foot, *parts(self.states).place[3:])))
         return standing(scene, stem).motion(in_contact(ground, flying_body(scene, flying, ground, stem)))
 
+    @of_each_run
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic energy plus weight times the height of the centre of mass [J]."""
+        return self.scene.energy(self.states) + lifted(self.scene, self.states, *self.above)
+
+    @of_each_run
+    def normal_force(self) -> Float[Array, " times"]:
+        """Normal force [N]; 0 in flight. If both spheres touch, this is the sum of both forces, the weight."""
+        force = self.scene.normal_force(self.states)
+        if self.scene.has_stem:
+            force = jnp.where(self.contact == 1, self._on_stem.normal_force, force)
+            force = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, force)
+        return jnp.where(self.contact < 0, 0.0, force)
+
+    @of_each_run
+    def slip(self) -> Float[Array, "times 2"]:
+        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's
+        sphere while it alone touches, otherwise of the top's own."""
+        slip = self.scene.slip_velocity(self.states)
+        if self.scene.has_stem:
+            of_stem = self._on_stem.slip
+            slip = jnp.where(self.contact == 1, jnp.stack([of_stem.x, of_stem.y]), slip)
+        return slip.T
+
+    @classmethod
+    def parts_of(cls, scene: Scene, rows: Values, mode: Any, core: int) -> dict[str, Any]:
+        # The rows end with the distance and its rate.
+        parts = super().parts_of(scene, rows[:-2], mode, core)
+        return parts | {"distance": rows[-2:], "contact": cls.touching(scene, mode)}
+
+    @staticmethod
+    def touching(scene: Scene, numbers: Values) -> Values:
+        """The sphere that touches, for each mode index."""
+        if scene.flies_in_closed_form:
+            return numbers
+        if scene.friction.set_valued:
+            # Between two modes, a slip begins.
+            return -1 * (numbers == FLYING)
+        # Also for traced numbers; -1 after the end of a run.
+        return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
+
     @property
-    def where_the_model_ends(self) -> str:
-        body = self.scene.body
-        height = self.resampled(np.array([self.end_time])).distance[0, 0]
-        if body.stem is not None and abs(height) < NEAR * body.radius:
+    def _whether_it_turned_over(self) -> str:
+        if not (self.scene.has_stem and np.isfinite(self.stem_time)):
+            return super()._whether_it_turned_over
+        again = ", and at the end its sphere touches again" if np.asarray(self.contact)[-1] in (0, 2) else ""
+        return f"turned over: the stem first carries it at {self.stem_time:.6g} s{again}"
+
+    def reason(self) -> str:
+        assert self.hops is not None
+        contacts = sum(segment.number != BETWEEN for segment in self.dense.segments)
+        if self.dense.status != UNRESOLVED:
+            return super().reason()
+        if len(self.hops) >= MOST_BOUNCES or contacts >= MOST_ROUNDS:
+            return "there were too many flights or changes of contact"
+        if self.scene.flies_in_closed_form:
+            return (
+                "sphere and stem touch the plane together, and friction is so strong that the forces are not determined"
+            )
+        body, distance = self.scene.body, self.resampled(np.array([self.end_time])).distance[0, 0]
+        if body.stem is not None and abs(distance) < NEAR * body.radius:
             return (
                 "sphere and stem came to rest on the arena together; sliding on both at once is implemented only for the level "
                 "plane, Plane() without tilt"
             )
         return "a flight does not end at the arena"
 
-    @staticmethod
-    def touching(scene: Scene, numbers: Values) -> Values:
-        if scene.friction.set_valued:
-            # Between two modes, a slip begins.
-            return -1 * (numbers == FLYING)
-        # Also for traced numbers; -1 after the end of a run.
-        return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
+    @property
+    def notes(self) -> list[str]:
+        # A run made inside a transformation knows only the number of flights.
+        if self.hops is None:
+            return [f"  {int(self.stats['hops'])} flights"] if "hops" in self.stats else []
+        return [f"  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"]
 
 
 # Simulate one launch of a top: a single run with its path, or a run inside a transformation.
@@ -430,30 +376,24 @@ def _ended(model: Any, outcome: HybridOutcome[Array], tolerance: Float[Array, ""
     return model.ended(outcome, tolerance)[0]
 
 
-def _status(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> str:
-    """The word for how a single run has ended."""
-    if isinstance(path, HybridPath):
-        code, state, mode = path.status, path.state, path.mode
-    else:
-        code = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
-        state, mode = np.asarray(path.states)[:, -1], 0
-    one, none = np.ones(1), np.zeros(1, int)
-    state, inf = np.asarray(state)[:, None], np.inf * one
-    outcome = HybridOutcome(
-        none + code, inf, one, state, none, none, np.stack([inf, one, one]), none + mode, none[None]
-    )
-    outcome = jax.tree.map(jnp.asarray, outcome)
-    return Status(int(_ended(model, outcome, jnp.asarray(tolerance)))).word
-
-
 def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> Any:
     """The run along its path, at the times of its steps. A run whose energy does not balance the work of friction and
     impacts ends as "unresolved"."""
     scene, kind, times = model.scene, model.trajectories, path.times
     mode, counts = (path.numbers(times), path.counts) if isinstance(path, HybridPath) else (None, ())
     end = path.end_time if isinstance(path, HybridPath) and scene.contact == "hybrid" else on_device(times[-1])[0]
-    status, start = _status(model, path, tolerance), scene.state(model.launch)
-    rows = np.asarray(path.states)
+    rows, start = np.asarray(path.states), scene.state(model.launch)
+    if isinstance(path, HybridPath):
+        code, state, last_mode = path.status, path.state, path.mode
+    else:
+        code = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
+        state, last_mode = rows[:, -1], 0
+    one, none = np.ones(1), np.zeros(1, int)
+    state, inf = np.asarray(state)[:, None], np.inf * one
+    outcome = HybridOutcome(
+        none + code, inf, one, state, none, none, np.stack([inf, one, one]), none + last_mode, none[None]
+    )
+    status = Status(int(_ended(model, jax.tree.map(jnp.asarray, outcome), jnp.asarray(tolerance)))).word
     # The states and what else has a value for each time come next.
     run = kind(times, scene, rows, rows, times, times, status, end, dense=path, start=start, launch=model.launch)
     # NumPy slices the states, because JAX would compile each slice again for every number of steps.

@@ -1,7 +1,7 @@
 """The functions for launches of a top: single runs, inversion times, tables."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -22,37 +22,189 @@ from nonholonomic.integration.problem import (
     FAILED,
     MOST_STEPS,
     Status,
+    require_run,
     require_times,
     run_bounds,
 )
+from nonholonomic.parameters import full_axes, numbers, with_numbers
 from nonholonomic.runs.event import EventTime, time_of_event
 from nonholonomic.runs.lyapunov import LyapunovExponent, exponent_of_model
 from nonholonomic.runs.model import Number, settings_for_lanes
 from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_sensitivities, samples_of
 from nonholonomic.runs.table import TableForm, TableJob
-from nonholonomic.sweeps import Table
+from nonholonomic.sweeps import Axis, Table, axis
 from nonholonomic.terminal import status_line
 from nonholonomic.text import shown
-from nonholonomic.validation import as_number, is_traced, require, require_all, require_kind, require_outside, warn
-
-from ..model.dynamics import inclination, parts
-from ..model.scene import Launch, Scene
-from ..modes.problems import InversionProblem, StemContact
-from .launches import (
-    check_event,
-    check_reversible,
-    check_run,
-    check_smooth,
-    event_of,
-    launches,
-    require_rigid,
-    warn_if_it_cannot_invert,
+from nonholonomic.validation import (
+    IN_DEGREES,
+    as_number,
+    is_traced,
+    require,
+    require_all,
+    require_kind,
+    require_outside,
+    warn,
 )
-from .model import INVERSIONS, REVERSALS, TopModel, why_unresolved
+
+from ..friction import Frictionless
+from ..model.body import Top
+from ..model.dynamics import inclination, parts
+from ..model.rigid import AbstractRigidBody
+from ..model.scene import Launch, Scene
+from ..modes.problems import InversionProblem, StemContact, angle_of, event_of
+from .model import INVERSIONS, NUMBERS_OF_A_LAUNCH, REVERSALS, SEVERAL, TopModel, variable_numbers, why_unresolved
 from .observables import QUANTITIES, quantities_of
 from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
+# Checks of the arguments of a run, before anything compiles and inside a program.
+
+#: The most turns a second by hand: greater spins are not taken for turns a second.
+MOST_TURNS = 50.0
+
+#: Advice in messages about lists, where a table is the better choice.
+LISTS = "inversion_table takes lists, and jax.vmap maps over them"
+
+
+def check_run(scene: Any, launch: Any, t1: Number, tolerance: Number, lists: str = LISTS) -> None:
+    """Raise `ValueError` unless the arguments are a scene, a launch that the scene allows, a positive horizon and a
+    legal tolerance.
+
+    **Arguments:** as for `require_run`.
+    """
+    require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
+    scene.check_start(launch)
+
+
+def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: object, angle: Any) -> None:
+    """Warn if the scene has no friction, if the top stands exactly upright on a level plane or is inverted already, or if
+    it is too slow to turn over, and would not be if its spin were in turns a second.
+
+    **Arguments:** `launch`: its theta and its spin are ignored; `theta`: one angle or several [rad]; `spin`: one or
+    several [rad/s]; `angle`: the angle to be reached, or `None` (see `event_of`).
+    """
+    if isinstance(scene.friction, Frictionless):
+        warn(
+            "friction = Frictionless(): without friction no top turns over; give the scene a law, such as "
+            "tippe.Scene(top, friction=tippe.Viscous(0.3))"
+        )
+    limit = angle_of(scene, angle)
+    if isinstance(scene.body, AbstractRigidBody) or is_traced(theta) or is_traced(limit):
+        return
+    if np.any(np.asarray(theta) >= np.min(limit)):
+        start = np.max(np.asarray(theta))
+        on_stem = angle is None and scene.has_stem
+        reached = "the angle at which the stem touches a level plane" if on_stem else "the angle to be reached"
+        warn(
+            f"theta = {start:g} rad is not below {reached}, {float(np.min(limit)):.4g} rad: the top "
+            f"{'stands on its stem' if on_stem else 'is inverted'} from the start{IN_DEGREES.format(f'{start:g}')}"
+        )
+    at_rest = launch.velocity is None and launch.angular_velocity is None
+    if scene.level and at_rest and np.any(np.asarray(theta) == 0.0):
+        warn("theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad")
+    if not isinstance(scene.body, Top) or not at_rest or is_traced((scene, spin)):
+        return
+    # The spin of which Jellett's constant is that of the tumbling top at the angle (`steady.tumbling`).
+    body, fastest = scene.body, float(np.max(np.abs(np.asarray(spin))))
+    mass, R, a, I1, I3 = (float(getattr(body, name)) for name in body.units)
+    end, start = (float(np.cos(np.min(inclination))) for inclination in (limit, theta))
+    if abs(I1 - I3) * R < I3 * a and start * R > a and fastest <= MOST_TURNS:
+        precession = math.sqrt(mass * float(scene.gravity) * a / (I3 * (a / R - end) + I1 * end))
+        slowest = R * (I1 * (1.0 - end**2) + I3 * (end - a / R) ** 2) * precession / (I3 * (R * start - a))
+        if fastest < slowest < 2.0 * math.pi * fastest:
+            advice = f"was it in turns a second? {fastest:.4g} turns a second are {2.0 * math.pi * fastest:.4g} rad/s"
+            warn(f"spin = {fastest:.4g} rad/s is slow: this top needs about {slowest:.3g} rad/s to turn over; {advice}")
+
+
+def check_smooth(scene: Scene, caller: str) -> None:
+    """Raise `ValueError` for a scene with hybrid runs, which do not support derivatives here."""
+    if scene.contact == "hybrid":
+        raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table supports flights")
+    if scene.friction.set_valued:
+        kind = type(scene.friction).__name__
+        raise ValueError(
+            f"friction = {kind} must be a law with a single mode for {caller}; inversion_table supports others"
+        )
+
+
+def check_reversible(scene: Scene, launch: Launch, values: Mapping[str, Any] | None = None) -> None:
+    """Raise `ValueError` for a body that cannot reverse its spin, and for a launch without spin.
+
+    **Arguments:** `values`: full name of a number -> values in place of the launch's own.
+    """
+    if not isinstance(scene.body, AbstractRigidBody):
+        kind = type(scene.body).__name__
+        raise ValueError(
+            f"body = {kind} must be an Ellipsoid or a RigidBody for times of reversal: a body of revolution keeps its "
+            "sense of rotation"
+        )
+    spin = (values or {}).get("launch.spin", launch.spin)
+    if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
+        raise ValueError("spin = 0.0 must not be zero: a spin of zero cannot reverse")
+
+
+def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
+    """Raise `ValueError` unless the angle is `None` or in (0, pi], and the crossing is a known word."""
+    if angle is not None:
+        require(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
+    if angle is not None and np.ndim(angle) != 0:
+        raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
+    if crossing not in known:
+        raise ValueError(f"crossing = {shown(crossing)} must be {' or '.join(map(repr, known))}")
+
+
 # Tables of many launches: inversion times, reversal times, and trajectories.
+
+
+def launches(
+    scene: Any, launch_values: dict[str, Any], axes: Any, t1: Number, tolerance: Number, taken: Collection[str] = ()
+) -> tuple[dict[str, Any], list[Axis]]:
+    """The scene and launch that all cells share, and the axes of the grid.
+
+    **Arguments:**
+
+    - `scene`: the scene; all its numbers must be scalars.
+    - `launch_values`: parameter of the launch, or "mu" for the scene's friction -> a number or a list; `None` keeps the
+      scene's own `mu`.
+    - `axes`: full name of a parameter, or its unambiguous end -> values, or `None`; the numbers of a launch's vectors
+      are `"launch.place[0]"` and so on; omitted numbers are 0.
+    - `t1`, `tolerance`: as for `inversion_table`.
+    - `taken`: names that no axis may have, as for `TopModel.label`.
+
+    **Returns:** a dictionary with "scene" and "launch", in which only the numbers that are not axes have their values,
+    for `with_numbers`; and the axes, the last varying fastest.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown axis.
+    """
+    require_kind(scene, "scene", Scene)
+    if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
+        raise ValueError(f"axes = {shown(axes)} must be a dictionary, path of a number -> values")
+    axes = full_axes(axes or {}, [*variable_numbers(scene), *NUMBERS_OF_A_LAUNCH])
+    friction_numbers = numbers("scene.friction", scene.friction)
+    of_mu = next((number for number in friction_numbers if number.endswith(".mu")), "scene.friction.mu")
+    paths = {name: of_mu if name == "mu" else f"launch.{name}" for name in launch_values}
+    values = {paths[name]: value for name, value in launch_values.items() if name != "mu" or value is not None}
+    for number in values:
+        if number in axes:
+            raise ValueError(f"axes: {number!r} has its own argument")
+    values |= axes
+    scalars = {number: value for number, value in values.items() if np.ndim(value) == 0}
+    # A launch with entries for all given numbers.
+    sizes = {name: len(parts) for name, parts in SEVERAL.items()}
+    sizes["place"] = 3 if "launch.place[2]" in values else len(scene.surface.coordinates)
+    parts = {name: [f"launch.{name}[{k}]" for k in range(size)] for name, size in sizes.items()}
+    vectors = {
+        name: tuple(scalars.get(part, 0.0) for part in own) for name, own in parts.items() if set(own) & set(values)
+    }
+    angles = {name: scalars.get(f"launch.{name}", 0.0) for name in ("theta", "spin", "eta", "azimuth")}
+    launch = Launch(**angles, **vectors)
+    names = TopModel(scene=scene, launch=launch).label(list(values), taken)
+    listed = [(number, *names[number]) for number in values if number not in scalars]
+    grid = [axis(name, number, unit, values[number], long_name) for number, name, unit, long_name in listed]
+    of_scene = {number: value for number, value in scalars.items() if not number.startswith("launch.")}
+    roots = with_numbers({"scene": scene}, of_scene) | {"launch": launch}
+    # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
+    require_run(roots["scene"], roots["launch"], t1, tolerance, (Scene, Launch), LISTS)
+    return roots, grid
 
 
 def too_many_steps(t1: float, max_steps: int, end: float) -> str:
@@ -222,8 +374,6 @@ def reversal_table(
     ```
     """
     require_outside((scene, theta, spin, azimuth, mu, axes, t1), "reversal_table", "reversal_time")
-    require_kind(scene, "scene", Scene)
-    require_rigid(scene)
     launch_values = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
     return event_table(scene, launch_values, axes, t1, None, options)
@@ -256,7 +406,7 @@ def event_table(
     check_cells(model, grid, options)
     axis_values = {axis.number: axis.values for axis in grid}
     if angle is None:
-        check_reversible(roots["launch"], axis_values)
+        check_reversible(scene, roots["launch"], axis_values)
         request: dict[str, object] = {"event": "reversal"}
     else:
         on_stem = isinstance(angle, StemContact)
@@ -527,8 +677,7 @@ def reversal_time(
     ```
     """
     check_run(scene, launch, t1, tolerance, "reversal_table takes lists, and jax.vmap maps over them")
-    require_rigid(scene)
-    check_reversible(launch, {})
+    check_reversible(scene, launch)
     return first_or_last_time(TopModel.timed(scene, launch, None), t1, "first", settings_for_lanes(tolerance, solver))
 
 

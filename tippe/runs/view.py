@@ -39,9 +39,10 @@ from ..model.body import AbstractBody, Top
 from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
 from ..modes.plane import Slide
-from .launches import check_reversible, check_run, event_of
+from ..modes.problems import event_of
 from .model import TopModel
 from .observables import OF_RIGID_BODIES, QUANTITIES, AbstractTrajectory, names_of
+from .verbs import check_reversible, check_run
 
 # The drawing of a run: body, trace of the contact, path of the axis, arrows, and curves over time.
 
@@ -180,11 +181,19 @@ def arena_of(scene: Scene, runs: list[Frame[np.ndarray]], normal: np.ndarray, ma
 def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[views.Mesh, ...]:
     """The body in two colours; a top has its stem, or a short stem that only shows the axis."""
     if isinstance(body, AbstractRigidBody):
-        return tuple(
-            mesh._replace(vertices=touching(body, mesh.vertices)) for mesh in views.ball(1.0, (colour, views.PALE))
-        )
+        rigid_meshes = []
+        for mesh in views.ball(1.0, (colour, views.PALE)):
+            # The points of the surface at which the body has the outward unit normals of a ball.
+            normal, zero = tuple(-jnp.asarray(mesh.vertices).T), jnp.zeros(len(mesh.vertices))
+            vertices = np.stack(body.contact(normal, (zero, zero, zero))[0], axis=-1)
+            rigid_meshes.append(mesh._replace(vertices=vertices))
+        return tuple(rigid_meshes)
     if not isinstance(body, Top):
-        return views.striped(profile(body), (colour, views.PALE))
+        # The meridian from the top of the axis down: (distance from the axis, height above the centre of mass) [m].
+        theta = jnp.linspace(jnp.pi, 0.0, 49)
+        lever = body.meridian.at(jnp.cos(theta))
+        meridian = (lever.radius * jnp.sin(theta), lever.offset - lever.radius * jnp.cos(theta))
+        return views.striped(np.stack(meridian, axis=-1), (colour, views.PALE))
     radius = float(body.radius)
     if body.stem is None:
         sphere = views.ball(radius, (colour, views.PALE))
@@ -199,13 +208,6 @@ def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[views.M
     )
 
 
-def touching(body: AbstractRigidBody, directions: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
-    """The points of a body's surface at which it has the given outward unit normals, from the centre of mass, in the
-    body's axes [m]."""
-    normal, zero = tuple(-jnp.asarray(directions).T), jnp.zeros(len(directions))
-    return np.stack(body.contact(normal, (zero, zero, zero))[0], axis=-1)
-
-
 def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "points 2"]:
     """The meridian of a ball whose cap is cut off, about its centre, from the flat down.
 
@@ -215,13 +217,6 @@ def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "poin
     polar = np.linspace(np.arccos((radius - 0.8 * (radius - lower_radius)) / radius), np.pi, 25)
     sphere = radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1)
     return np.concatenate([[[0.0, sphere[0, 1]]], sphere])
-
-
-def profile(body: AbstractBody) -> Float[np.ndarray, "points 2"]:
-    """The meridian of a body about its centre of mass, from the top of its axis down: (distance from the axis, height) [m]."""
-    theta = jnp.linspace(jnp.pi, 0.0, 49)
-    lever = body.meridian.at(jnp.cos(theta))
-    return np.stack([lever.radius * jnp.sin(theta), lever.offset - lever.radius * jnp.cos(theta)], axis=-1)
 
 
 # A page with sliders that simulates a top in the browser.
@@ -298,7 +293,7 @@ def page_of_launch(model: TopModel, sliders: Sliders | None, t1: float) -> LiveR
     # A body that rolls keeps its energy: it does not invert, and the page shows times of reversal.
     reverses = isinstance(scene.friction, NoSlip)
     if reverses:
-        check_reversible(launch, {})
+        check_reversible(scene, launch)
     # The position of the stem's end is relative to the centre of mass, so another offset would change the shape.
     paths_drawn = ("scene.body.stem.", "scene.body.offset") if scene.has_stem else ()
     knobs = sliders_of(model, default_ranges(scene, launch) if sliders is None else sliders, paths_drawn)
