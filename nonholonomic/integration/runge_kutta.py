@@ -46,7 +46,7 @@ class Step(NamedTuple):
       the step; 2 if there was none.
     - `margins`: all margins at `watched_places` of the step; `None` if there are none.
     - `rates`: the field at all stages; `middle`: the state in the middle of the step, to fifth order.
-    - `stages`: the field at the inner stages (`inner_stages`) in one array, whose memory the next step reuses.
+    - `stages`: the field at the inner stages (`inner_stages`) and at the end, in one array whose memory the next step reuses.
     """
 
     state: States
@@ -95,7 +95,7 @@ def explicit_step(
 ) -> Step:
     """Try one step in every lane.
 
-    The stages are computed in a loop, so that the field is compiled twice and not once per stage. In one kernel the
+    The stages are computed in a loop, so that the field is compiled once and not once per stage. In one kernel the
     loop runs as fast as unrolled stages, and compiles in half the time.
 
     **Arguments:**
@@ -109,43 +109,41 @@ def explicit_step(
     - `time`, `state`, `rate`: time and state at the start of the step, and the field there.
     - `length`: length of the step [s], one per lane.
     - `margins_before`: the margins at the start; `None` if there are none.
-    - `stages`: memory for the inner stages (`memory_for_stages`), whose numbers do not matter. A loop over steps passes it
+    - `stages`: memory for the stages (`memory_for_stages`), whose numbers do not matter. A loop over steps passes it
       on from step to step: clearing new memory would take a tenth of the time of a step.
 
     **Returns:** a `Step`.
     """
     field, crossing = traced_once(field, time + length, state), traced_once(crossing, state, rate)
     inner = inner_stages(tableau)
-    places, is_look = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
-    rows = jnp.asarray(np.searchsorted(looks, np.arange(inner)) + 1)
+    # The end of the step is the last stage.
+    weights, checked = [*tableau.a_lower[:inner], tableau.b_sol[: 1 + inner]], [*looks, inner]
+    places = jnp.asarray([*tableau.c[:inner], 1.0])
+    is_checked = jnp.asarray(np.isin(np.arange(1 + inner), checked))
+    rows = jnp.asarray(np.searchsorted(checked, np.arange(1 + inner)) + 1)
 
-    def do(stage: Int[Array, ""], carry: tuple[Stages, History | None]) -> tuple[Stages, History | None]:
-        stages, history = carry
-        trial = moved_state(stage, tableau.a_lower[:inner], state, length, stages, first=rate)
+    def do(stage: Int[Array, ""], carry: tuple[States, Stages, History | None]) -> tuple[States, Stages, History | None]:
+        _, stages, history = carry
+        trial = moved_state(stage, weights, state, length, stages, first=rate)
         stage_time = time + places[stage] * length
 
-        def look(history: History) -> History:
+        def check(history: History) -> History:
             return written_in_place(history, jnp.stack(margins(stage_time, trial)), at=rows[stage])
 
         # A branch, because margins in every stage would add a tenth to the cost of a step of a top in a cylinder.
-        history = None if history is None else jax.lax.cond(is_look[stage], look, lambda history: history, history)
-        return written_by_component(stages, field(stage_time, trial), at=stage), history
+        history = None if history is None else jax.lax.cond(is_checked[stage], check, lambda history: history, history)
+        return trial, written_by_component(stages, field(stage_time, trial), at=stage), history
 
     history = None
     if margins_before is not None:
         margins = traced_once(margins, time + length, state)
         history = jnp.zeros((2 + len(looks), *margins_before.shape), margins_before.dtype)
         history = written_in_place(history, margins_before, at=jnp.zeros((), int))
-    stages, history = over_stages(inner, do, (stages, history))
+    end, stages, history = over_stages(1 + inner, do, (state, stages, history))
     rates = [rate, *jnp.unstack(stages)]
-    # Stored, because the step, its error and the event all depend on it.
-    end = jax.lax.optimization_barrier(state + length * weighted_sum(tableau.b_sol[: 1 + inner], rates))
-    last_rate = jax.lax.optimization_barrier(field(time + length, end))
-    last = None if history is None else jax.lax.optimization_barrier(jnp.stack(margins(time + length, end)))
-    least = None if last is None else jnp.min(last, axis=0)
+    last_rate = rates[-1]
+    least = None if history is None else jnp.min(history[-1], axis=0)
     margin_at_end = jax.lax.optimization_barrier(lesser(least, crossing(end, last_rate), length))
-    if history is not None and last is not None:
-        history = written_in_place(history, last, at=jnp.asarray(1 + len(looks)))
     # Read from the last version of `history`: if an earlier one were still in use, the compiler would copy it.
     first_negative = jnp.full_like(length, 2.0)
     for row, stage in enumerate(looks, start=1):
@@ -153,8 +151,8 @@ def explicit_step(
         least = None if history is None else jnp.min(history[row], axis=0)
         margin = lesser(least, crossing(trial, rates[stage + 1]), length)
         first_negative = jnp.minimum(first_negative, jnp.where(margin < 0.0, tableau.c[stage], 2.0))
-    middle = state + length * weighted_sum(middle_weights(tableau), [*rates, last_rate])
-    rates += [last_rate] if tableau.fsal else []
+    middle = state + length * weighted_sum(middle_weights(tableau), rates)
+    rates = rates if tableau.fsal else rates[:-1]
     error = length * weighted_sum(tableau.b_error, rates)
     return Step(end, last_rate, error, margin_at_end, first_negative, history, rates, middle, stages)
 
@@ -190,8 +188,8 @@ def middle_weights(tableau: diffrax.ButcherTableau) -> tuple[float, ...]:
 
 
 def memory_for_stages(tableau: diffrax.ButcherTableau, state: States) -> Stages:
-    """Memory in which `explicit_step` stores the field at the inner stages."""
-    return jnp.zeros((inner_stages(tableau), *state.shape), state.dtype)
+    """Memory in which `explicit_step` stores the field at the stages after the first, and at the end of the step."""
+    return jnp.zeros((1 + inner_stages(tableau), *state.shape), state.dtype)
 
 
 def watched_places(tableau: diffrax.ButcherTableau, looks: Sequence[int]) -> Float[np.ndarray, " places"]:
@@ -274,18 +272,17 @@ def inverse_root(value: Lanes, order: int) -> Lanes:
     return value ** (-1.0 / order)
 
 
-def first_length(
+def first_rate_and_length(
     field: Callable[[Lanes, States], States],
     time: Lanes,
     state: States,
-    rate: States,
     order: int,
     rtol: Float[Array, ""],
     atol: States,
     n_blocks: int,
-) -> Lanes:
-    """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own unit
-    of time.
+) -> tuple[States, Lanes]:
+    """The field at the start, and the length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section
+    II.4), in the motion's own unit of time.
 
     The comparison of |y'| with |y''| in their formula depends on the unit of time; Diffrax uses seconds. Here the unit
     is |y|/|y'|, so that motions that differ only in scale are integrated alike. If the state has several blocks
@@ -297,16 +294,24 @@ def first_length(
     def measure(vector: States) -> Lanes:
         return jnp.sqrt(jnp.mean((vector / scale)[:size] ** 2, axis=0))
 
-    magnitude, slope = measure(state), measure(rate)
-    unit = magnitude / slope
-    # A state at rest has no unit of time of its own; longer units would overflow below.
-    at_rest = (magnitude < 1e-5) | ~(unit < 1e15)
-    unit = jnp.where(at_rest, 1e-4, unit)
-    trial = 0.01 * unit
-    bend = measure(field(time + trial, state + trial * rate) - rate) / trial
+    def unit_of(rate: States) -> Lanes:
+        magnitude = measure(state)
+        unit = magnitude / measure(rate)
+        # A state at rest has no unit of time of its own; longer units would overflow below.
+        at_rest = (magnitude < 1e-5) | ~(unit < 1e15)
+        return jnp.where(at_rest, 1e-4, unit)
+
+    def evaluate(count: Int[Array, ""], rates: Stages) -> Stages:
+        # The second time after a short step along the first rate; a loop, so that the field is compiled once.
+        trial = jnp.where(count == 0, 0.0, 0.01 * unit_of(rates[0]))
+        return written_in_place(rates, field(time + trial, state + trial * rates[0]), at=count)
+
+    rate, later_rate = over_stages(2, evaluate, jnp.zeros((2, *state.shape), state.dtype))
+    unit, slope = unit_of(rate), measure(rate)
+    bend = measure(later_rate - rate) / (0.01 * unit)
     max_slope = unit * jnp.maximum(slope, unit * bend)
     fraction = jnp.where(max_slope <= 1e-15, 0.01, inverse_root(jnp.maximum(max_slope, 1e-15) * 100.0, order))
-    return unit * jnp.minimum(1.0, fraction)
+    return rate, unit * jnp.minimum(1.0, fraction)
 
 
 # Pairs of orders 8 and 7.

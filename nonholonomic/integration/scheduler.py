@@ -18,7 +18,7 @@ from ..compilation.xla_cpu import compiled_alone, in_one_kernel, traced_once
 from ..text import shown
 from .events import Bracket
 from .problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, Settings, crossing_time, lanes_for
-from .runge_kutta import Integers, Lanes, States, explicit_tableau, first_length, memory_for_stages
+from .runge_kutta import Integers, Lanes, States, explicit_tableau, first_rate_and_length, memory_for_stages
 from .step import Control, LaneState, try_step
 
 #: JAX's arrays, or NumPy's on the host.
@@ -157,8 +157,8 @@ class LaneScheduler(eqx.Module):
             # Beyond a jump at the start, also by a clock in the state.
             states = states + jumps.begin(begin) * field(begin, states)
             begin = jumps.begin(begin)
-        rates, atols = field(begin, states), settings.absolute * rtol * scales
-        lengths = first_length(field, begin, states, rates, control.order, rtol, atols, n_blocks)
+        atols = settings.absolute * rtol * scales
+        rates, lengths = first_rate_and_length(field, begin, states, control.order, rtol, atols, n_blocks)
         fresh = _fresh_lanes(problem, control, states, rates, jnp.minimum(stop_gradient(lengths), t1))
         fresh = fresh._replace(time=begin)
         lanes = lanes_for(states.shape[1]) if settings.lanes is None else settings.lanes

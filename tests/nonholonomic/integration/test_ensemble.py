@@ -129,7 +129,7 @@ def test_steps_reuse_the_memory_of_their_stages():
     scheduler = LaneScheduler.of(problem, jnp.asarray(1.0), jnp.asarray(8), Settings(1e-6, SOLVER))
     jax.eval_shape(lambda: scheduler.run(scheduler.start(), Watching())[0].iterations)
     (of_stages, largest), *_ = sizes
-    assert of_stages == 12 * 2 * 8
+    assert of_stages == 13 * 2 * 8
     assert largest < of_stages / 2
 
 
