@@ -122,7 +122,9 @@ def explicit_step(
     is_checked = jnp.asarray(np.isin(np.arange(1 + inner), checked))
     rows = jnp.asarray(np.searchsorted(checked, np.arange(1 + inner)) + 1)
 
-    def do(stage: Int[Array, ""], carry: tuple[States, Stages, History | None]) -> tuple[States, Stages, History | None]:
+    def do(
+        stage: Int[Array, ""], carry: tuple[States, Stages, History | None]
+    ) -> tuple[States, Stages, History | None]:
         _, stages, history = carry
         trial = moved_state(stage, weights, state, length, stages, first=rate)
         stage_time = time + places[stage] * length
