@@ -16,7 +16,6 @@ from nonholonomic.compilation.xla_cpu import least, stored, stored_with_tangents
 from nonholonomic.geometry import (
     AbstractFrame,
     Component,
-    FrameMotion,
     PlaneFrame,
     Tangent,
     Vector,
@@ -215,35 +214,6 @@ class AbstractContactDynamics(AbstractDynamics):
         return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
 
 
-class Rolled(NamedTuple):
-    """How a body that rolls moves over the arena, with all vectors in the moving frame.
-
-    - `angular_velocity`: w [rad/s]; `lever`, `lever_rate`: the vector r from the centre of mass to the contact [m], and its
-      rate as a vector, not of its components.
-    - `velocity`: as in `Motion`; `frame`: the motion of the frame.
-    """
-
-    angular_velocity: Vector
-    lever: Vector
-    lever_rate: Vector
-    velocity: Tangent
-    frame: FrameMotion
-
-
-def carried_rates(
-    frame: FrameMotion, gravity: Float[Array, "..."], push: Vector, rise: Component, *turning: tuple[Vector, Vector]
-) -> tuple[Component, ...]:
-    """Rate of change of a state's components, in the frame that moves with the contact.
-
-    **Arguments:** `push`: force along the arena, over the mass [m/s^2]; `rise`: velocity of the centre of mass along n
-    [m/s]; `turning`: the axis, the angular momentum and, for a body of any inertia, its x axis, each with its rate.
-    """
-    o, up, place_rate, _, _ = frame
-    u_dot = [add(push[k], multiply(-gravity, up[k]), multiply(o[k], rise)) for k in (0, 1)]
-    e_dot, L_dot, *x_dot = [sum_vectors(rate, rate_in_frame(vector, o)) for vector, rate in turning]
-    return (*u_dot, *e_dot, *L_dot, *place_rate, *(x_dot[0] if x_dot else ()))
-
-
 class AbstractRollingDynamics(AbstractContactDynamics):
     """Equations of motion of a body whose contact point is at rest on the arena.
 
@@ -260,28 +230,9 @@ class AbstractRollingDynamics(AbstractContactDynamics):
         return self.body.mass * self.gravity
 
     @abc.abstractmethod
-    def rolled(self, state: Components) -> "Rolled":
-        """How a body that rolls moves over the arena."""
-
     def evaluate(self, state: Components) -> tuple[Motion, Vector]:
-        """The motion, whose `friction` is the force along the arena per unit normal force; and the force F of the arena on
-        the body [N] in the moving frame: the components along the arena, and the normal force.
-
-        With the velocity r x w of the centre of mass and r' the rate of r as a vector,
-        (J + m (r^2 - r r^T)) w' = L x w + m r x (r' x w + g z), and F = m (r' x w + r x w' + g z).
-        """
-        (w, r, r_dot, velocity, frame), (_, e, L, place), m = self.rolled(state), parts(state), self.body.mass
-        steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, frame.vertical))
-        torque = sum_vectors(cross(L, w), scale(m, cross(r, steady_push)))
-        push = sum_vectors(steady_push, cross(r, self.over_inertia(state, r, torque)))
-        F = scale(m, push)
-        turning = [(e, cross(w, e)), (L, cross(r, F))]
-        if x_axis := place[len(frame.place_rate) :]:
-            turning.append((x_axis, cross(w, x_axis)))
-        rate = carried_rates(frame, self.gravity, push, cross(r, w)[2], *turning)
-        zero = jnp.zeros_like(F[2])
-        load, slip = ContactLoad((F[0] / F[2], F[1] / F[2])), Slip(zero, zero, (w[0], w[1], None))
-        return Motion(rate, F[2], load, slip, velocity, frame.frame_rate, dot(w, e), 1.0 + zero, frame.room), F
+        """The motion, whose `friction` is the force along the arena per unit normal force; and the force of the arena on
+        the body [N] in the moving frame: the components along the arena, and the normal force."""
 
     def motion(self, state: Components) -> Motion:
         return self.evaluate(state)[0]
@@ -412,8 +363,7 @@ class Dynamics(AbstractContactDynamics):
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
         changing = multiply(growth, e_dot[2])
         path = (add(V[0], multiply(changing, e[0])), add(V[1], multiply(changing, e[1])))
-        frame = self.frame.frame_motion(place, path)
-        o, up, _, room, _ = frame
+        o, up, place_rate, room, _ = self.frame.frame_motion(place, path)
 
         spin_momentum = dot(L, e)
         along_axis = self.axial_excess * spin_momentum
@@ -444,8 +394,12 @@ class Dynamics(AbstractContactDynamics):
         N = load / painleve_factor
 
         thrust = N * self.per_mass
-        push, rise = (multiply(thrust, f1), multiply(thrust, f2)), multiply(-a, e_dot[2])
-        rate = carried_rates(frame, self.gravity, push, rise, (e, e_dot), (L, scale(N, (M1, M2, M3))))
+        u3 = multiply(-a, e_dot[2])
+        u1_dot = add(multiply(thrust, f1), multiply(-self.gravity, up[0]), multiply(o[0], u3))
+        u2_dot = add(multiply(thrust, f2), multiply(-self.gravity, up[1]), multiply(o[1], u3))
+        e_dot = sum_vectors(e_dot, rate_in_frame(e, o))
+        L_dot = sum_vectors(scale(N, (M1, M2, M3)), rate_in_frame(L, o))
+        rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
         if self.turns is not None:
             turn = self.turns * self.per_transverse * L[2]
             u_turn, e_turn, L_turn = [turned(vector, turn) for vector in ((u1, u2), e, L)]
@@ -474,13 +428,36 @@ class RollingDynamics(AbstractRollingDynamics):
         _, e, L, _ = parts(state)
         return angular_velocity(self.body, e, L), self.body.meridian.contact(e)
 
-    def rolled(self, state: Components) -> Rolled:
-        (w, r), (_, e, _, place), R = self.rotation(state), parts(state), self.body.radius
+    def evaluate(self, state: Components) -> tuple[Motion, Vector]:
+        """The motion and the reaction F.
+
+        (J + m (r^2 - r r^T)) w' = -w x L + m r x (r' x w) + m g r x z, with r' = a e' - R n'; then u' = r' x w + r x w',
+        F = m (u' + g z), and L' = r x F.
+        """
+        (w, r), (_, e, L, place) = self.rotation(state), parts(state)
+        R, a, m = self.body.radius, self.body.offset, self.body.mass
+        e_dot = cross(w, e)
         V: Tangent = (R * w[1], -R * w[0])
-        frame = self.frame.frame_motion(place, V)
-        # r = a e - R n, and n' = -(o1 t1 + o2 t2).
-        r_dot = sum_vectors(scale(self.body.offset, cross(w, e)), scale(R, (*frame.frame_rate, None)))
-        return Rolled(w, r, r_dot, V, frame)
+        o, up, place_rate, room, _ = self.frame.frame_motion(place, V)
+        # n' = -(o1 t1 + o2 t2), and r' as a vector, not as the rate of its components.
+        r_dot = sum_vectors(scale(a, e_dot), scale(R, (*o, None)))
+        u = cross(r, w)
+
+        steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, up))
+        torque = sum_vectors(scale(m, cross(r, steady_push)), cross(L, w))
+        w_dot = self.over_inertia(state, r, torque)
+        push = sum_vectors(steady_push, cross(r, w_dot))
+
+        u1_dot = add(push[0], multiply(-self.gravity, up[0]), multiply(o[0], u[2]))
+        u2_dot = add(push[1], multiply(-self.gravity, up[1]), multiply(o[1], u[2]))
+        F = scale(m, push)
+        e_dot = sum_vectors(e_dot, rate_in_frame(e, o))
+        L_dot = sum_vectors(cross(r, F), rate_in_frame(L, o))
+        rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
+        zero = jnp.zeros_like(F[2])
+        load = ContactLoad((F[0] / F[2], F[1] / F[2]))
+        slip = Slip(zero, zero, (w[0], w[1], None))
+        return Motion(rate, F[2], load, slip, V, o, dot(w, e), 1.0 + zero, room), F
 
     def momentum(self, state: States, w: Vector) -> Vector:
         e = parts(state).axis

@@ -24,6 +24,7 @@ from nonholonomic.compilation.tracing import with_own_numbers
 from nonholonomic.compilation.xla_cpu import stored
 from nonholonomic.geometry import (
     AbstractFrame,
+    Component,
     FrameMotion,
     Place,
     PlaneFrame,
@@ -33,6 +34,7 @@ from nonholonomic.geometry import (
     cross,
     dot,
     multiply,
+    rate_in_frame,
     scale,
     subtract,
     sum_vectors,
@@ -41,14 +43,12 @@ from nonholonomic.integration import Components, States
 from nonholonomic.text import shown
 from nonholonomic.validation import UNTRACEABLE, ArrayOrList, Bound, Bounded, as_number, is_traced
 
-from ..friction import AbstractFriction, Slip
+from ..friction import AbstractFriction, ContactLoad, Slip
 from .dynamics import (
     AXIS,
     AbstractContactDynamics,
     AbstractRollingDynamics,
     Motion,
-    Rolled,
-    carried_rates,
     from_frame,
     parts,
     to_frame,
@@ -487,7 +487,7 @@ class Attitude(NamedTuple):
     - `axes`: the body's axes x, y and z in the frame (t1, t2, n).
     - `normal`, `momentum`, `angular_velocity`: n, angular momentum and angular velocity in the body's axes.
     - `lever`: the vector r from the centre of mass to the contact [m] in the body's axes.
-    - `lever_rate`: rate of change of the components of r if n is fixed, as on a plane.
+    - `fixed_rates`: rates of change of the components of n and of r if n is fixed, as on a plane.
     """
 
     axes: tuple[Vector, Vector, Vector]
@@ -495,13 +495,19 @@ class Attitude(NamedTuple):
     momentum: Vector
     angular_velocity: Vector
     lever: Vector
+    fixed_rates: tuple[Vector, Vector]
+
+
+class ContactMotion(NamedTuple):
+    """The motion of the contact point.
+
+    - `normal_rate`, `lever_rate`: rates of change of the components of n and of r in the body's axes.
+    - `frame`: motion of the frame and of the contact point along the arena.
+    """
+
+    normal_rate: Vector
     lever_rate: Vector
-
-
-def body_axes(state: Components) -> tuple[Vector, Vector, Vector]:
-    """The body's axes x, y and z in the frame (t1, t2, n)."""
-    _, e, _, place = parts(state)
-    return place[-3:], cross(e, place[-3:]), e
+    frame: FrameMotion
 
 
 class AbstractRigidDynamics(AbstractContactDynamics):
@@ -518,30 +524,62 @@ class AbstractRigidDynamics(AbstractContactDynamics):
 
     def attitude(self, state: Components) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
-        L, axes = parts(state).momentum, body_axes(state)
+        _, e, L, place = parts(state)
+        c = tuple(place[-3:])
+        axes = (c, cross(e, c), e)
         n = tuple(axis[2] for axis in axes)
         momentum = tuple(dot(L, axis) for axis in axes)
         angular_velocity = stored(*self.inverse.times(momentum))
-        return Attitude(axes, n, momentum, angular_velocity, *self.body.contact(n, cross(n, angular_velocity)))
+        normal_rate = cross(n, angular_velocity)
+        lever, lever_rate = self.body.contact(n, normal_rate)
+        return Attitude(axes, n, momentum, angular_velocity, lever, (normal_rate, lever_rate))
 
-    def contact_motion(self, place: Place, attitude: Attitude, slip: Tangent) -> FrameMotion:
-        """The motion of the frame with the contact point. **Arguments:** `place`: place of the frame; `slip`: velocity v
-        along the arena [m/s]."""
-        axes = attitude.axes
-        over_body = from_frame(attitude.lever_rate, axes)
+    def contact_motion(self, place: Place, attitude: Attitude, slip: Tangent) -> ContactMotion:
+        """The motion of the contact point. **Arguments:** `place`: place of the frame; `slip`: velocity v along the
+        arena [m/s]."""
+        normal_rate, lever_rate = attitude.fixed_rates
+        over_body, axes = from_frame(lever_rate, attitude.axes), attitude.axes
         V1, V2 = add(slip[0], over_body[0]), add(slip[1], over_body[1])
         if isinstance(self.frame, PlaneFrame):
-            return self.frame.frame_motion(place, (V1, V2))
+            return ContactMotion(normal_rate, lever_rate, self.frame.frame_motion(place, (V1, V2)))
         # If n turns along a tangent, the contact moves against it over the body, by H.
         tangents = [tuple(axis[k] for axis in axes) for k in (0, 1)]
         first, second = (from_frame(self.body.contact(attitude.normal, t)[1], axes) for t in tangents)
         H11, H12, H22, V1, V2 = stored(-first[0], -first[1], -second[1], V1, V2)
         frame = self.frame.frame_motion(place, (V1, V2), (H11, H12, H22))
-        return frame._replace(contact_velocity=stored(*frame.contact_velocity))
+        path = stored(*frame.contact_velocity)
+        frame_part = to_frame((subtract(None, frame.frame_rate[0]), subtract(None, frame.frame_rate[1]), None), axes)
+        lever_rate = to_frame((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None), axes)
+        return ContactMotion(sum_vectors(normal_rate, frame_part), lever_rate, frame._replace(contact_velocity=path))
 
-    def rotation(self, state: Components) -> tuple[Vector, Vector]:
+    def rotation(self, state: States) -> tuple[Vector, Vector]:
         attitude = self.attitude(state)
         return from_frame(attitude.angular_velocity, attitude.axes), from_frame(attitude.lever, attitude.axes)
+
+    def carried_rates(
+        self,
+        state: Components,
+        attitude: Attitude,
+        contact: ContactMotion,
+        push: Tangent,
+        rise: Component,
+        torque: tuple[Component, ...],
+    ) -> tuple[Component, ...]:
+        """Rate of change of the state's components, in the frame that moves with the contact.
+
+        **Arguments:** `push`: force along the arena, over the mass [m/s^2]; `rise`: velocity of the centre of mass along n
+        [m/s]; `torque`: L' [N m].
+        """
+        _, e, L, place = parts(state)
+        o, up, place_rate, _, _ = contact.frame
+        # The body's axes turn with it.
+        (x, y, z), (w1, w2, w3) = attitude.axes, attitude.angular_velocity
+        x_rate = tuple(w3 * b - w2 * c for b, c in zip(y, z, strict=True))
+        z_rate = tuple(w2 * a - w1 * b for a, b in zip(x, y, strict=True))
+        u1_dot = add(push[0], multiply(-self.gravity, up[0]), multiply(o[0], rise))
+        u2_dot = add(push[1], multiply(-self.gravity, up[1]), multiply(o[1], rise))
+        e_dot, L_dot = sum_vectors(z_rate, rate_in_frame(e, o)), sum_vectors(torque, rate_in_frame(L, o))
+        return (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate, *sum_vectors(x_rate, rate_in_frame(place[-3:], o)))
 
 
 class RigidSlipping(AbstractRigidDynamics):
@@ -556,25 +594,22 @@ class RigidSlipping(AbstractRigidDynamics):
         With q = r x n and J the inertia, all in the body's axes, the centre of mass rises at u.n = -w.q. Its second rate gives
         N (1 + m (J^-1 q).M) = m (g z.n + u.S q' - (J^-1 q).(L x w) - w.q'), M the moment per unit normal force.
         """
-        (u1, u2), e, L, place = parts(state)
+        (u1, u2), _, _, place = parts(state)
         attitude = self.attitude(state)
         axes, normal, momentum, w, lever, _ = attitude
         r, swing = from_frame(lever, axes), from_frame(cross(w, lever), axes)
         slip_x, slip_y = stored(u1 + swing[0], u2 + swing[1])
-        frame = self.contact_motion(place[:-3], attitude, (slip_x, slip_y))
-        o, up, _, room, path = frame
-        turning = from_frame(w, axes)
-        slip = Slip(slip_x, slip_y, (*turning[:2], turning[2] if self.friction.uses_spin else None))
+        contact = self.contact_motion(place[:-3], attitude, (slip_x, slip_y))
+        o, up, _, room, path = contact.frame
+        slip = Slip(slip_x, slip_y, from_frame(w, axes))
         friction = self.friction.per_normal_force(slip)
         f1, f2 = friction.force
         moment = stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque))
 
-        # The rate of q has no component along w from the rotation of the body, so the rates of r and n as vectors do.
-        r_dot = sum_vectors((subtract(path[0], slip_x), subtract(path[1], slip_y), None), cross(turning, r))
-        rise_rate = sum_vectors(cross(r_dot, (None, None, 1.0)), cross((*o, None), r))
         rise = cross(lever, normal)
         arm = self.inverse.times(rise)
-        bend = dot(arm, cross(momentum, w)) + dot(turning, rise_rate)
+        rise_rate = sum_vectors(cross(contact.lever_rate, normal), cross(lever, contact.normal_rate))
+        bend = dot(arm, cross(momentum, w)) + dot(w, rise_rate)
         mass = self.body.mass
         painleve_factor = 1.0 + mass * dot(arm, to_frame(moment, axes))
         pull = add(multiply(self.gravity, up[2]), dot((u1, u2), o))
@@ -582,21 +617,38 @@ class RigidSlipping(AbstractRigidDynamics):
 
         thrust = N * self.per_mass
         push = (multiply(thrust, f1), multiply(thrust, f2))
-        vectors = ((e, cross(turning, e)), (L, scale(N, moment)), (axes[0], cross(turning, axes[0])))
-        rate = carried_rates(frame, self.gravity, push, -dot(w, rise), *vectors)
-        return Motion(rate, N, friction, slip, path, o, w[2], painleve_factor, room)
+        u3 = None if o == (None, None) else -dot(w, rise)
+        rates = self.carried_rates(state, attitude, contact, push, u3, scale(N, moment))
+        return Motion(rates, N, friction, slip, path, o, w[2], painleve_factor, room)
 
 
 class RigidRolling(AbstractRigidDynamics, AbstractRollingDynamics):
     """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself."""
 
-    def rolled(self, state: Components) -> Rolled:
-        attitude = self.attitude(state)
-        w, r = (from_frame(vector, attitude.axes) for vector in (attitude.angular_velocity, attitude.lever))
-        frame = self.contact_motion(parts(state).place[:-3], attitude, (None, None))
-        # The contact moves over the body as over the arena.
-        path = frame.contact_velocity
-        return Rolled(w, r, sum_vectors((*path, None), cross(w, r)), path, frame)
+    def evaluate(self, state: Components) -> tuple[Motion, Vector]:
+        """The motion and the reaction F in the frame.
+
+        In the body's axes, with the velocity r x w of the centre of mass and r' the rate of r as a vector,
+        (J + m (r^2 - r r^T)) w' = L x w + m r x (r' x w + g z), and F = m (r' x w + r x w' + g z).
+        """
+        place, attitude = parts(state).place, self.attitude(state)
+        m, r, w = self.body.mass, attitude.lever, attitude.angular_velocity
+        contact = self.contact_motion(place[:-3], attitude, (None, None))
+        o, up, _, room, path = contact.frame
+        r_dot = sum_vectors(contact.lever_rate, cross(w, r))
+        steady_push = sum_vectors(cross(r_dot, w), scale(self.gravity, to_frame(up, attitude.axes)))
+        torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, steady_push)))
+        w_dot = self._about_contact(r).solve(stored(*torque))
+        reaction = from_frame(scale(m, sum_vectors(steady_push, cross(r, w_dot))), attitude.axes)
+        F = stored(*reaction)
+
+        push = (F[0] / m, F[1] / m)
+        u3 = None if o == (None, None) else dot(attitude.normal, cross(r, w))
+        rates = self.carried_rates(state, attitude, contact, push, u3, cross(from_frame(r, attitude.axes), F))
+        load = ContactLoad((F[0] / F[2], F[1] / F[2]))
+        zero = jnp.zeros_like(F[2])
+        slip = Slip(zero, zero, from_frame(w, attitude.axes))
+        return Motion(rates, F[2], load, slip, path, o, w[2], 1.0 + zero, room), F
 
     def _about_contact(self, lever: Vector) -> SymmetricMatrix:
         """The inertia about the contact, J + m (r^2 - r r^T), in the body's axes."""
@@ -611,12 +663,12 @@ class RigidRolling(AbstractRigidDynamics, AbstractRollingDynamics):
         )
 
     def over_inertia(self, state: Components, lever: Vector, torque: Vector) -> Vector:
-        axes = body_axes(state)
-        solution = self._about_contact(to_frame(lever, axes)).solve(stored(*to_frame(torque, axes)))
-        return stored(*from_frame(solution, axes))
+        axes = self.attitude(state).axes
+        solution = self._about_contact(to_frame(lever, axes)).solve(to_frame(torque, axes))
+        return from_frame(solution, axes)
 
     def momentum(self, state: States, w: Vector) -> Vector:
-        axes = body_axes(state)
+        axes = self.attitude(state).axes
         return from_frame(self.body.inertia.tensor.times(to_frame(w, axes)), axes)
 
     def with_unit_axes(self, state: States) -> States:
