@@ -390,7 +390,7 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
     **Arguments:**
 
     - `panels`: the panels; `ends` are the times [s] that get a dot, if finite.
-    - `angle`: angle [rad] that counts as inverted; `dots`: description of the dots, above the plot.
+    - `angle`: angle [rad] that counts as inverted; `dots`: description of the dots, below the plot.
 
     **Returns:** a matplotlib figure.
     """
@@ -411,7 +411,7 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
         drawing.set_xlabel("time [s]")
         drawing.set_yticks([0.0, np.pi / 2.0, np.pi], ["0", "π/2", "π"])
     drawings[0].set_ylabel("θ, angle from the normal to the stem [rad]")
-    figure.suptitle(dots, fontsize=9, color="0.4")
+    figure.supxlabel(dots, fontsize=10)
     if len(panels[-1].starts) > 1:
         drawings[-1].legend(title="θ(0) [rad]", loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure
