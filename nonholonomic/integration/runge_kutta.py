@@ -296,20 +296,21 @@ def first_rate_and_length(
     def measure(vector: States) -> Lanes:
         return jnp.sqrt(jnp.mean((vector / scale)[:size] ** 2, axis=0))
 
-    def unit_of(rate: States) -> Lanes:
-        magnitude = measure(state)
-        unit = magnitude / measure(rate)
+    magnitude = measure(state)
+
+    def evaluate(count: Int[Array, ""], carry: tuple[Stages, Lanes]) -> tuple[Stages, Lanes]:
+        rates, unit = carry
+        trial = 0.01 * unit
+        rates = written_in_place(rates, field(time + trial, state + trial * rates[0]), at=count)
+        unit = magnitude / measure(rates[0])
         # A state at rest has no unit of time of its own; longer units would overflow below.
         at_rest = (magnitude < 1e-5) | ~(unit < 1e15)
-        return jnp.where(at_rest, 1e-4, unit)
+        return rates, jnp.where(at_rest, 1e-4, unit)
 
-    def evaluate(count: Int[Array, ""], rates: Stages) -> Stages:
-        # The second time after a short step along the first rate; a loop, so that the field is compiled once.
-        trial = jnp.where(count == 0, 0.0, 0.01 * unit_of(rates[0]))
-        return written_in_place(rates, field(time + trial, state + trial * rates[0]), at=count)
-
-    rate, later_rate = over_stages(2, evaluate, jnp.zeros((2, *state.shape), state.dtype))
-    unit, slope = unit_of(rate), measure(rate)
+    # At the start, and after a short step along the first rate; in a loop, so that the field is compiled once.
+    start = jnp.zeros((2, *state.shape), state.dtype), jnp.zeros_like(state[0])
+    (rate, later_rate), unit = over_stages(2, evaluate, start)
+    slope = measure(rate)
     bend = measure(later_rate - rate) / (0.01 * unit)
     max_slope = unit * jnp.maximum(slope, unit * bend)
     fraction = jnp.where(max_slope <= 1e-15, 0.01, inverse_root(jnp.maximum(max_slope, 1e-15) * 100.0, order))
