@@ -114,8 +114,8 @@ def log_density(
     - `scene`, `data`, `free`, `tolerance`: as for `identify`. If the error of a recording is `None`, the error is also
       an unknown.
     - `priors`: name of a free parameter -> (mean, standard deviation) of a Gaussian prior; only the standard deviation, if
-      the mean is the start value; or a function, written in JAX, that returns the log density of the parameter. These
-      priors add to those of `Free`.
+      the mean is the start value; or a function, written in JAX, that returns the log density of the parameter. They
+      take precedence over those of `Free`.
 
     **Returns:** a `LogDensity`: a function of coordinates (unknowns,) for any sampler, with `value_and_gradient` for
     samplers without JAX, `values` to convert back to parameters, `names` and `start`. With flights or set-valued friction, it

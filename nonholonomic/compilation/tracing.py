@@ -514,7 +514,7 @@ def _quotient(a: Bounds, b: Bounds) -> Bounds:
 
 def _even(box: Bounds, function: Callable[[Array], Array]) -> Bounds:
     """Bounds of a function that is even and grows with the distance from zero."""
-    nearest = jnp.where(_contains_zero(box), 0.0, jnp.minimum(jnp.abs(box.low), jnp.abs(box.high)))
+    nearest = jnp.where(_contains_zero(box), jnp.zeros_like(box.low), jnp.minimum(jnp.abs(box.low), jnp.abs(box.high)))
     return Bounds(function(nearest), function(jnp.maximum(jnp.abs(box.low), jnp.abs(box.high))))
 
 

@@ -319,27 +319,29 @@ class Unknowns(eqx.Module):
 
     def values(self, coordinates: Float[Array | np.ndarray, "*batch unknowns"]) -> Any:
         """The parameters at given coordinates; in NumPy for a NumPy array, because JAX would compile for every shape."""
+        if coordinates.shape[-1] != len(self.start):
+            raise ValueError(f"coordinates must have {len(self.start)} numbers, not {coordinates.shape[-1]}")
         xp: Any = np if isinstance(coordinates, np.ndarray) and isinstance(self.start, np.ndarray) else jnp
         low, high = xp.isfinite(self.lower), xp.isfinite(self.upper)
         lower, upper = xp.where(low, self.lower, 0.0), xp.where(high, self.upper, 0.0)
         # 1 / (1 + exp(-x)) without an overflow.
-        between = lower + (upper - lower) * 0.5 * (1.0 + xp.tanh(0.5 * coordinates))
+        inside = lower + (upper - lower) * 0.5 * (1.0 + xp.tanh(0.5 * coordinates))
         # The functions of a single bound are evaluated only where they are used: their slopes may be infinite elsewhere.
         above, below = xp.where(low & ~high, coordinates, 0.0), xp.where(high & ~low, coordinates, 0.0)
         # A coordinate that is large enough stands for infinity.
         with np.errstate(over="ignore"):
             of_one_bound = [lower + xp.exp(above), upper - xp.exp(-below)]
         free = self.start + self.unit * coordinates
-        return xp.select([low & high, low, high], [between, *of_one_bound], free)
+        return xp.select([low & high, low, high], [inside, *of_one_bound], free)
 
     def coordinates(self, values: Float[np.ndarray, "*batch unknowns"]) -> Float[np.ndarray, "*batch unknowns"]:
         """The coordinates of values strictly within the bounds; the inverse of `values`."""
         low, high = np.isfinite(self.lower), np.isfinite(self.upper)
         # Logarithms of infinite distances are not used.
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", divide="ignore"):
             above, below = np.log(values - self.lower), np.log(self.upper - values)
-            between = above - below
-        return np.select([low & high, low, high], [between, above, -below], (values - self.start) / self.unit)
+            inside = above - below
+        return np.select([low & high, low, high], [inside, above, -below], (values - self.start) / self.unit)
 
     @eqx.filter_jit
     def prior_residuals(self, coordinates: Float[Array, "rows unknowns"]) -> tuple[Array, Array]:

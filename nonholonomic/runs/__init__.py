@@ -1,6 +1,6 @@
 """The questions about runs, once for every model: a run, the time of an event, tables, fits, exponents, pages.
 
-An `AbstractModel` answers what one system is: its modes for a start, its quantities, its words for how a run ends, and its
+An `AbstractModel` answers what one system is: its modes for a start, its quantities, how a run ended, and its
 parameters by name. `model_of` finds the model of a scene or of a user's own system.
 """
 

@@ -17,7 +17,6 @@ import platform
 import re
 import shutil
 import zlib
-from collections import UserDict
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
@@ -38,6 +37,9 @@ if TYPE_CHECKING:
 
 #: The group of the checksums.
 CHECKSUMS = "checksums"
+
+#: Attributes that describe the file and not its table; earlier versions wrote the last two.
+OF_THE_FILE = ("Conventions", "inner", "long_names")
 
 #: Variables of tables larger than this [bytes] are read only when needed.
 MAX_BYTES_IN_MEMORY = 1 << 27
@@ -186,7 +188,7 @@ def _attribute(node: "h5py.HLObject", name: str, is_text: bool = False) -> Any:
     return value
 
 
-class Stored(UserDict[str, Any]):
+class Stored(Mapping[str, Values]):
     """The variables of a table that stays in its file: each is read, and checked against its checksums, when needed.
 
     `path`: the file; `layout`: its contents.
@@ -204,13 +206,21 @@ class Stored(UserDict[str, Any]):
         self.path = path
         with self._opened() as file:
             self.layout, self._sums = _contents(file)
-        # The names alone; `__getitem__` reads the numbers.
-        self.data = dict.fromkeys(self.layout.kinds)
 
     def __getitem__(self, name: str) -> Values:
         if name not in self:
             raise KeyError(name)
         return self.layout.shaped(name, self.whole(name))
+
+    # Of a `Mapping`, it would read the numbers.
+    def __contains__(self, name: object) -> bool:
+        return name in self.layout.kinds
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.layout.kinds)
+
+    def __len__(self) -> int:
+        return len(self.layout.kinds)
 
     def whole(self, name: str) -> Values:
         """A variable of all cells, which are along the first axis.
@@ -263,7 +273,7 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     coords, kinds, units, words, inner, shapes, long_names = {}, {}, {}, {}, {}, {}, {}
     if "request" not in file.attrs:
         raise ValueError("it names no request")
-    attributes = {name: _attribute(file, name) for name in file.attrs if name != "Conventions"}
+    attributes = {name: _attribute(file, name) for name in file.attrs if name not in OF_THE_FILE}
     for name in ("request", "versions"):
         if not isinstance(json.loads(attributes.get(name, "{}")), dict):
             raise ValueError(f"the attribute {name} is not a dictionary")
@@ -291,6 +301,9 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
             kinds[name], shapes[name] = array.dtype, array.shape
             if dims := list(array.dims)[len(axes) :]:
                 inner[name] = tuple(str(dim[0].name).removeprefix("/") for dim in dims)
+    # The dimensions of a variable that a user has left out belong to no variable.
+    used = {*axes, *(dim for dims in inner.values() for dim in dims)}
+    coords = {name: values for name, values in coords.items() if name in used}
     coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
     layout = Layout(coords, kinds, units, attributes, words, inner, int(_attribute(checksums, "block")), long_names)
     if layout.chunk < 1:

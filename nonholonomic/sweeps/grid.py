@@ -103,9 +103,9 @@ class Layout(NamedTuple):
         return cells * sum(kind.itemsize * math.prod(self.inner_shape(name)) for name, kind in self.kinds.items())
 
 
-def attributes_of(request: dict[str, object], axes: list[str]) -> dict[str, str]:
+def attributes_of(request: str, axes: list[str]) -> dict[str, str]:
     """The attributes of a table: what was computed, in JSON, over which axes, and with which versions."""
-    return {"request": json.dumps(request, default=repr), "axes": json.dumps(axes), "versions": json.dumps(versions())}
+    return {"request": request, "axes": json.dumps(axes), "versions": json.dumps(versions())}
 
 
 def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import itertools
+import json
 import multiprocessing
 import os
 import pickle
@@ -332,7 +333,8 @@ def layout_of(
     without_unit = {*words, *(name for name, values in coords.items() if values.dtype.kind == "U")}
     units = {name: part.unit for name, part in described.items() if name not in without_unit}
     request = request | {"float": str(np.dtype(jnp.result_type(float)))}
-    attributes = attributes_of(request, [axis.name for axis in axes])
+    # Without `default`: the text of an object would not tell two requests apart.
+    attributes = attributes_of(json.dumps(request), [axis.name for axis in axes])
     long_names = {name: part.long_name for name, part in described.items() if part.long_name}
     kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
     dims = {name: variable.inner for name, variable in variables.items() if variable.inner}
@@ -505,8 +507,12 @@ class LocalProcesses(Executor):
         """Call a function in one of the processes; its future raises `BrokenProcessPool` if the process dies."""
         return self._callers.submit(self._called, function, arguments, options)
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
-        """End the processes, after the calls that have begun; also at the end of the context."""
+    def __exit__(self, *_: object) -> None:
+        """End the processes, after the calls that have begun."""
+        self.shutdown(cancel_futures=True)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes, after all calls, or after those that have begun."""
         self._callers.shutdown(wait, cancel_futures=cancel_futures)
         for pool in self._pools:
             if pool is not None:

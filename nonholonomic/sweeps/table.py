@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -473,7 +474,7 @@ def run_table(
     long_names = {"time": "time"} | {name: quantity.long_name for name, quantity in quantities.items()}
     units = {"time": "s"} | {name: quantity.unit for name, quantity in quantities.items()}
     inner = {name: (quantity.components,) for name, quantity in quantities.items() if quantity.components is not None}
-    attributes = attributes_of(request, axes)
+    attributes = attributes_of(json.dumps(request, default=repr), axes)
     return Table(coords, values, units, attributes, {}, inner, long_names)
 
 

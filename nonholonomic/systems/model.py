@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -65,8 +65,6 @@ class OwnModel(AbstractModel):
     form: Form = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     event: None = None
-
-    words: ClassVar[tuple[str, ...]] = ("event", "completed", "stopped", "failed", "unresolved", "illegal")
 
     @classmethod
     def of(cls, tree: dict[str, Any]) -> "OwnModel":

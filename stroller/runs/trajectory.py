@@ -377,7 +377,7 @@ class Trajectory(AbstractRun):
         the radii of curvature.
         """
         scene = self.model.scene
-        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(self.state.T)[0])
+        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(jnp.moveaxis(self.state, -1, 0))[0])
         error = 0.0 if curvature is None else jnp.abs(curvature) * scene.body.wheelbase**2 / 6.0
         return jnp.broadcast_to(error, self.t.shape)
 

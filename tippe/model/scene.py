@@ -1,7 +1,6 @@
 """The scene, with its body, arena, friction and gravity; and the launches that start runs in it."""
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Iterator
 from typing import Any, ClassVar, Generic, TypeVar
@@ -162,8 +161,9 @@ class Launch(Bounded):
         )
 
     def bounds(self) -> Iterator[Bound]:
-        no_eta = Bound(self.eta, "eta", at_least=0.0, at_most=0.0, why="place is given")
-        return itertools.chain(super().bounds(), [] if self.place is None else [no_eta])
+        yield from super().bounds()
+        if self.place is not None:
+            yield Bound(self.eta, "eta", at_least=0.0, at_most=0.0, why="place is given")
 
 
 def as_launch(value: Any) -> Any:
@@ -287,7 +287,8 @@ class Scene(Bounded, Generic[Body]):
             )
 
     def bounds(self) -> Iterator[Bound]:
-        surface, own = self.surface, []
+        yield from super().bounds()
+        surface = self.surface
         if isinstance(surface, Cylinder | Sphere | Torus) and surface.sign(self.side, "inside") < 0.0:
             # The radius that the arena must exceed so that the body fits inside.
             room = self.body.size
@@ -295,8 +296,7 @@ class Scene(Bounded, Generic[Body]):
                 lowest, highest = self.body.half_widths
                 room = highest if isinstance(surface, Sphere) else lowest
             name = "tube" if isinstance(surface, Torus) else "radius"
-            own.append(Bound(getattr(surface, name), f"surface {name}", above=room, why="the body must fit inside"))
-        return itertools.chain(super().bounds(), own)
+            yield Bound(getattr(surface, name), f"surface {name}", above=room, why="the body must fit inside")
 
     def suspicion(self) -> str | None:
         for name, value in numbers("surface", self.surface, functions=False).items():

@@ -196,7 +196,7 @@ def energy_in(scene: Scene, state: States, mode: Int[Array, " cells"]) -> tuple[
 
 
 def lifted(
-    scene: Scene[Top], state: Float[Array, "14 ..."], distance: ArrayLike, rate: ArrayLike
+    scene: Scene[Top], state: Float[Array, "components ..."], distance: ArrayLike, rate: ArrayLike
 ) -> Float[Array, "..."]:
     """Difference [J] between the energy of a flying top and that of the same state in contact; `distance` [m] is that
     of its sphere from the ground, and `rate` [m/s] the rate of this distance."""

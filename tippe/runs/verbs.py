@@ -126,17 +126,22 @@ def check_smooth(scene: Scene, caller: str) -> None:
         )
 
 
-def check_reversible(scene: Scene, launch: Launch, values: Mapping[str, Any] | None = None) -> None:
-    """Raise `ValueError` for a body that cannot reverse its spin, and for a launch without spin.
-
-    **Arguments:** `values`: full name of a number -> values in place of the launch's own.
-    """
+def require_rigid(scene: Scene) -> None:
+    """Raise `ValueError` for a body that cannot reverse its spin."""
     if not isinstance(scene.body, AbstractRigidBody):
         kind = type(scene.body).__name__
         raise ValueError(
             f"body = {kind} must be an Ellipsoid or a RigidBody for times of reversal: a body of revolution keeps its "
             "sense of rotation"
         )
+
+
+def check_reversible(scene: Scene, launch: Launch, values: Mapping[str, Any] | None = None) -> None:
+    """Raise `ValueError` for a body that cannot reverse its spin, and for a launch without spin.
+
+    **Arguments:** `values`: full name of a number -> values in place of the launch's own.
+    """
+    require_rigid(scene)
     spin = (values or {}).get("launch.spin", launch.spin)
     if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
         raise ValueError("spin = 0.0 must not be zero: a spin of zero cannot reverse")
@@ -374,6 +379,7 @@ def reversal_table(
     ```
     """
     require_outside((scene, theta, spin, azimuth, mu, axes, t1), "reversal_table", "reversal_time")
+    require_rigid(scene)
     launch_values = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
     return event_table(scene, launch_values, axes, t1, None, options)

@@ -146,7 +146,16 @@ def test_bounds_are_kept_and_positive_numbers_are_fitted_in_logarithms():
     assert 2.99 < fit.estimates["x"] < 3.0
     free = {"a": Free(2.0), "b": Free(2.0, 0.0), "c": Free(2.0, -1.0, 3.0), "d": Free(2.0, upper=5.0)}
     unknowns = Unknowns(free, {})
-    assert_close(unknowns.values(unknowns.coordinates(np.full(4, 2.5))), np.full(4, 2.5), rtol=1e-12)
+    coordinates = unknowns.coordinates(np.full(4, 2.5))
+    for place in (coordinates, jnp.asarray(coordinates)):
+        assert_close(unknowns.values(place), np.full(4, 2.5), rtol=1e-12)
+    slopes = np.diag(jax.jacfwd(unknowns.values)(jnp.asarray(coordinates)))
+    expected = np.diag(
+        [(unknowns.values(coordinates + h) - unknowns.values(coordinates - h)) / 2e-6 for h in 1e-6 * np.eye(4)]
+    )
+    assert_close(slopes, expected, rtol=1e-8)
+    with pytest.raises(ValueError, match="coordinates must have 4 numbers, not 1"):
+        unknowns.values(coordinates[:1])
     fit = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0)})
     assert_close(np.sqrt(fit.coordinate_covariance[0, 0]), 0.1 / np.sqrt(2.0) / 4.05, rtol=1e-4)
 

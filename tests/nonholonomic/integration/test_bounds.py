@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholonomic.compilation.tracing import RULES, Bounds, UnboundedError, enclosing
+from nonholonomic.compilation.tracing import (
+    MONOTONE,
+    RULES,
+    RULES_WITH_PARAMETERS,
+    Bounds,
+    UnboundedError,
+    enclosing,
+)
 
 FUNCTIONS = {
     "abs": jnp.abs,
@@ -49,11 +56,12 @@ FUNCTIONS = {
         jnp.int32(x > 0.0) + jnp.int32(y > 0.0), jnp.sin(x), jnp.cos(x), jnp.exp(x)
     ),
     "called": lambda x, y: jax.jit(jnp.sin)(x) + jax.nn.softplus(y),
+    "whole": lambda x, y: jnp.where((jnp.abs(jnp.arange(4) - 1) < 2)[3], x, y),
 }
 
 
 def test_every_rule_is_tested():
-    assert set(RULES) <= set(FUNCTIONS)
+    assert {*RULES, *MONOTONE, *RULES_WITH_PARAMETERS} <= set(FUNCTIONS)
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
