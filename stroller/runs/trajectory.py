@@ -376,8 +376,10 @@ class Trajectory(AbstractRun):
         K is the Gaussian curvature (`stroller.md`, section 9). The model holds if the wheelbase is short compared with
         the radii of curvature.
         """
+        if jnp.ndim(self.t) > 1:
+            return eqx.filter_vmap(lambda run: run.wheelbase_error)(self)
         scene = self.model.scene
-        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(jnp.moveaxis(self.state, -1, 0))[0])
+        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(self.state.T)[0])
         error = 0.0 if curvature is None else jnp.abs(curvature) * scene.body.wheelbase**2 / 6.0
         return jnp.broadcast_to(error, self.t.shape)
 

@@ -167,6 +167,18 @@ def test_derivatives_by_the_ground():
     np.testing.assert_allclose(batch[1], end(0.8, Hill), rtol=1e-9)
 
 
+def test_the_error_of_the_wheelbase_on_a_sphere_is_that_of_its_curvature():
+    scene = Scene(BODY, Sphere(4.0), Damping(0.3, 0.1, 0.1, 0.05))
+
+    def run(speed):
+        return stroller.simulate(scene, Launch((0.3, 0.2), 0.4, speed), 0.5, times=[0.25, 0.5])
+
+    expected = BODY.wheelbase**2 / (6.0 * 4.0**2)
+    np.testing.assert_allclose(run(1.0).wheelbase_error, np.full(2, expected), rtol=1e-9)
+    batch = jax.vmap(run)(jnp.array([0.5, 1.0, 1.5]))
+    np.testing.assert_allclose(batch.wheelbase_error, np.full((3, 2), expected), rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_a_hill_is_found_from_a_ride_over_it():
     times = np.linspace(0.2, 2.0, 10)

@@ -15,10 +15,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cheap_sweep import BLOCK, cheap_sweep, finished_blocks, resumed
+from cheap_sweep import BLOCK, VARIABLES, X, cheap_sweep, expected, finished_blocks, resumed
 from disk_faults import FOR_A_BLOCK, FOR_THE_FILE, FOR_THE_FOLDER, Killed, fail_on_disk
 
-from nonholonomic.sweeps import Table, grid
+from nonholonomic.sweeps import Table, axis, grid, sweep
 from nonholonomic.sweeps._store import ChunkStore
 from nonholonomic.sweeps.grid import Layout
 
@@ -236,3 +236,15 @@ def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
         patch.setattr(grid, "versions", lambda: versions | {"nonholonomic": "99.0"})
         with pytest.raises(ValueError, match=r"another run: nonholonomic is .* in the file and 99\.0 here"):
             cheap_sweep(path)
+
+
+def test_a_request_must_be_plain_data():
+    """The text of a long array leaves out most of it, so two different requests would be one."""
+    with pytest.raises(TypeError, match="ndarray is not JSON serializable"):
+        sweep(
+            lambda columns, count: expected(columns["x"]),
+            [axis("x", "x", "s", X)],
+            VARIABLES,
+            {"what": np.arange(2000.0)},
+            progress=False,
+        )
