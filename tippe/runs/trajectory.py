@@ -328,8 +328,9 @@ class HybridTrajectory(AbstractTrajectory):
     @property
     def notes(self) -> list[str]:
         # A run made inside a transformation knows only the number of flights.
-        if self.hops is None:
+        if "impact_loss" not in self.stats:
             return [f"  {int(self.stats['hops'])} flights"] if "hops" in self.stats else []
+        assert self.hops is not None
         return [f"  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"]
 
 
