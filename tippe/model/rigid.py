@@ -552,7 +552,7 @@ class AbstractRigidDynamics(AbstractContactDynamics):
         lever_rate = to_frame((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None), axes)
         return ContactMotion(sum_vectors(normal_rate, frame_part), lever_rate, frame._replace(contact_velocity=path))
 
-    def rotation(self, state: States) -> tuple[Vector, Vector]:
+    def rotation(self, state: Components) -> tuple[Vector, Vector]:
         attitude = self.attitude(state)
         return from_frame(attitude.angular_velocity, attitude.axes), from_frame(attitude.lever, attitude.axes)
 
