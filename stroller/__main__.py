@@ -207,10 +207,8 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
 
     **Returns:** name -> contents of each file, and of the audit.
     """
-    grounds, helm = (
-        dict.fromkeys(ground for ground, _ in scenes(options)),
-        Helm(options.force, options.steer, options.period),
-    )
+    grounds = dict.fromkeys(ground for ground, _ in scenes(options))
+    helm = Helm(options.force, options.steer, options.period)
     jobs = [partial(parked, options), *(partial(audited, options, helm, ground) for ground in grounds)]
     jobs.append(partial(tolerance_curve, options, helm))
     results, texts = [], []
@@ -224,7 +222,8 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
             with display.aside():
                 print(texts[-1], flush=True)
             display.advance(1)
-    parking, rides = results[0], {name: run for runs in results[1:-1] for name, run in runs.items()}
+    parking, *rides_by_ground, _ = results
+    rides = {name: run for runs in rides_by_ground for name, run in runs.items()}
     names = ["_".join(name).replace(" ", "_") for name in rides]
     request = {name: value for name, value in vars(options).items() if name != "out"}
     with status_line("drawing"):

@@ -198,12 +198,12 @@ class Identification:
                 last = times[-1] + share * 1e-6 * (times[-1] - times[0])
                 return {"times": np.append(times[:-1] + share * np.diff(times), last)}
 
-            there = eqx.tree_at(lambda problem: problem.model, problem, problem.model.with_times(moved))
+            shifted = eqx.tree_at(lambda problem: problem.model, problem, problem.model.with_times(moved))
             times = []
-            for source, original in zip(there.model.recorded, data, strict=True):
+            for source, original in zip(shifted.model.recorded, data, strict=True):
                 offset = source.times[0] - original.times[0] if isinstance(source, AbstractRecording) else 0.0
                 times.append(np.asarray(source.measurements.time + offset))
-            slices.append((np.concatenate(times), predictions(there, coordinates[None])[0]))
+            slices.append((np.concatenate(times), predictions(shifted, coordinates[None])[0]))
         times, values = zip(*slices, strict=True)
         return np.stack(times), np.stack(values)
 

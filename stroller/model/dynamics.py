@@ -187,9 +187,9 @@ class Dynamics(eqx.Module):
         """The position of a place, and the heading at an angle [rad] there."""
         position, east, north = self.surface.chart(place)
         cosine, sine = jnp.cos(angle), jnp.sin(angle)
-        return position, (cosine, sine, None) if self.projected else sum_vectors(
-            scale(cosine, east), scale(sine, north)
-        )
+        if self.projected:
+            return position, (cosine, sine, None)
+        return position, sum_vectors(scale(cosine, east), scale(sine, north))
 
     def angle(self, position: Vector, heading: Vector) -> Float[Array, "..."]:
         """The angle [rad] of a heading at a position, in (-pi, pi]."""

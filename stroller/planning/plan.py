@@ -132,8 +132,8 @@ class Plan(eqx.Module):
             above.fill(*foot.T[:2], color="0.6") if axes == 2 else draw(foot[[*range(len(foot)), 0]], "0.4", 1.5)
         for line in self.candidates:
             draw(line, "0.75", 0.7)
-        shown = np.linspace(0, len(self.run.t) - 1, OUTLINES).astype(int)
-        for corners in outlines(problem, problem.footprint, self.run.state[shown, : 2 * surface.axes]):
+        drawn = np.linspace(0, len(self.run.t) - 1, OUTLINES).astype(int)
+        for corners in outlines(problem, problem.footprint, self.run.state[drawn, : 2 * surface.axes]):
             draw(corners[CLOSED], "C0", 0.6)
         draw(self.run.position, "C0", 1.5, "rear axle")
         is_cross, target = problem.goal.heading is None, goal_corners(problem)
@@ -551,8 +551,8 @@ def planned_stage(plan: Plan) -> Stage:
         still.append(("obstacles", [prism(foot, HEIGHT * length) for foot in feet]))
     ends = goal_corners(problem, 2.0 * RAISED * length)
     pairs = (ends[:2], ends[2:]) if problem.goal.heading is None else (ends, np.roll(ends, -1, axis=0))
-    arms = zip(*(map(tuple, points) for points in pairs), strict=True)
-    still.append(("goal", [bar(a, b, 2.0 * THIN * length, GREEN) for a, b in arms]))
+    arms = [bar(tuple(a), tuple(b), 2.0 * THIN * length, GREEN) for a, b in zip(*pairs, strict=True)]
+    still.append(("goal", arms))
     place, turn = np.zeros((count, 3)), np.tile(UNTURNED, (count, 1))
     bodies = tuple(Body(name, place, turn, tuple(meshes)) for name, meshes in still)
     vehicle = show.bodies[0]

@@ -324,10 +324,12 @@ class Search:
         number = np.arange(nx * ny).reshape(nx, ny)
         links = []
         for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
-            here = (slice(0, nx - dx), slice(max(0, -dy), ny - max(0, dy)))
-            there = (slice(dx, nx), slice(max(0, dy), ny + min(0, dy)))
-            both = free[here] & free[there]
-            links.append([number[here][both], number[there][both], np.full(both.sum(), self.cell * np.hypot(dx, dy))])
+            cells = (slice(0, nx - dx), slice(max(0, -dy), ny - max(0, dy)))
+            neighbours = (slice(dx, nx), slice(max(0, dy), ny + min(0, dy)))
+            both = free[cells] & free[neighbours]
+            links.append(
+                [number[cells][both], number[neighbours][both], np.full(both.sum(), self.cell * np.hypot(dx, dy))]
+            )
         starts, ends, lengths = map(np.concatenate, zip(*links, strict=True))
         graph = scipy.sparse.csr_array((lengths, (starts, ends)), shape=(nx * ny, nx * ny))
         return scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=number[self.places(place)]).reshape(nx, ny)

@@ -395,6 +395,7 @@ def draw_rides(rides: dict[tuple[str, str], Trajectory]) -> Any:
             panels[2].plot(run.t, run.side_force[:, 0], color=colour)
             panels[2].plot(run.t, run.side_force[:, 1], color=colour, linestyle="--")
         space.set(title=ground, xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+        space.xaxis.labelpad = space.yaxis.labelpad = 8
         # As many ticks along each axis as there is room for; a plane has nearly no height to show.
         spans = np.ptp(lines, axis=(0, 1))
         for axis, span in zip((space.xaxis, space.yaxis, space.zaxis), spans, strict=True):

@@ -100,10 +100,8 @@ class StickSlipMode(AbstractBatchedMode):
         status = jnp.where(change.lost, LEFT_DOMAIN, jnp.where(ends, CROSSED, status))
         state_after = jnp.where(is_beyond, state, jnp.where(ends, onset.at(fraction), change.state))
         rolls = jnp.where(is_beyond | change.lost, self.kind.rolls, change.rolls)
-        mode, counts = (
-            jnp.where(rolls, ROLLING, SLIPPING),
-            [change.rolls & ~change.lost & ~is_beyond & (not self.kind.rolls)],
-        )
+        mode = jnp.where(rolls, ROLLING, SLIPPING)
+        counts = [change.rolls & ~change.lost & ~is_beyond & (not self.kind.rolls)]
         if self.scene is not None:
             lost_state = self.carried_along(state_after) if self.kind.rolls else state_after
             flies = (status == LEFT_DOMAIN) & (self.kind.loss(lost_state[: airborne.OWN]) == 0)
