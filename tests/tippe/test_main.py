@@ -209,7 +209,7 @@ def test_the_picture_of_one_launch_states_its_angle_and_fits_a_phone():
     assert figure.axes[0].get_title() == "wooden top, 1900 rpm, θ(0) = 12°, mu = 0.3, on a table"
     assert figure.axes[0].get_legend() is None
     assert figure.get_figwidth() <= 8.0
-    assert figure.get_suptitle().startswith("The dot is the time at which the stem first carries the top.")
+    assert figure.get_supxlabel().startswith("The dot is the time at which the stem first carries the top.")
     # Without a dot, nothing is said of one.
     plane.variables["time"][:] = np.inf
-    assert job.picture(options, times, 0.2 + 0.0 * times, plane).get_suptitle() == "Not turned over by 5 s."
+    assert job.picture(options, times, 0.2 + 0.0 * times, plane).get_supxlabel() == "Not turned over by 5 s."
