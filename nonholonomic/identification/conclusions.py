@@ -99,7 +99,7 @@ def judge(
 
     **Returns:** a `Verdict`.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     measurements, by_slopes = ends.density.measurements, ends.covariance(ends.best)
     prediction, residual = ends.linearised.prediction[ends.best], ends.linearised.residual[ends.best]
@@ -110,7 +110,7 @@ def judge(
     scores = normal_scores(measurements, prediction)
     chi_squared, p_value = float(np.sum(scores[exact] ** 2)), math.nan
     if degrees > 0 and not np.any(np.asarray(measurements.estimated)):
-        p_value = float(chi2.sf(chi_squared, degrees)) if math.isfinite(chi_squared) else 0.0
+        p_value = float(chdtrc(degrees, chi_squared)) if math.isfinite(chi_squared) else 0.0
     numbers = np.asarray(measurements.series)
     parts = [scores[exact & (numbers == number)] for number in np.unique(numbers)]
     orders = [runs_of_signs(part) for part in parts]
@@ -184,12 +184,12 @@ def sentences(*table: tuple[object, str]) -> tuple[str, ...]:
 
 def normal_scores(measurements: Measurements, prediction: PerPoint) -> PerPoint:
     """Residuals converted to numbers that are normal if the stated errors are right; 0 for limits."""
-    from scipy.stats import norm, t
+    from scipy.special import ndtri, stdtr
 
     z = np.asarray(measurements.standardised(np.asarray(prediction)))
     freedom = np.asarray(measurements.student)
     heavy = np.isfinite(freedom)
-    return np.where(heavy, np.sign(z) * norm.isf(t.sf(np.abs(z), np.where(heavy, freedom, 1.0))), z)
+    return np.where(heavy, -np.sign(z) * ndtri(stdtr(np.where(heavy, freedom, 1.0), -np.abs(z))), z)
 
 
 def runs_of_signs(values: PerPoint) -> Series:
