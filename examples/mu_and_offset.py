@@ -23,7 +23,7 @@ def main() -> None:
     measured = np.asarray(times) + ERROR * np.random.default_rng(1).normal(size=len(THETA))
     data = tippe.InversionTimes(tippe.Launch(THETA, SPIN), measured, ERROR, t1=60.0, angle=ANGLE)
     fit = tippe.identify(top, data, {"friction.mu": 0.45, "offset": 0.005}, starts=4)
-    print(fit)
+    print(fit, fit.details, sep="\n")
     for name, value in truth.items():
         low, high = fit.interval(name)
         print(f"truth {name} = {value}: {'inside' if low < value < high else 'outside'} its 95 % interval")

@@ -18,7 +18,7 @@ def main() -> None:
     recorded = path + error * np.random.default_rng(1).normal(size=path.shape)
     data = stroller.Recording(launch, times, recorded, error)
     fit = stroller.identify(scene(1.0, 1.4), data, {"friction.rolling": 1.0, "wheelbase": 1.4}, starts=4)
-    print(fit)
+    print(fit, fit.details, sep="\n")
     for name, value in truth.items():
         low, high = fit.interval(name)
         print(f"truth {name} = {value}: {'inside' if low < value < high else 'outside'} its 95 % interval")

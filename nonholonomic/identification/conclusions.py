@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from .exploration import FARTHEST, ROWS, Explorer, Pool, fitted, squared_distances, weighted_covariance
 from .posterior import Coordinates, Matrix, Measurements, PerPoint, Points, Problem, deviances, predictions
-from .search import SAME, Minima, minimise
+from .search import Minima, minimise
 
 # Only for type checkers: results stand above conclusions.
 if TYPE_CHECKING:
@@ -68,6 +68,14 @@ class Verdict(NamedTuple):
         return not self.concerns
 
     def __str__(self) -> str:
+        """Whether to believe the fit, and what to do; `details` has the statistics behind it."""
+        if self.good:
+            return "no concerns about this fit"
+        return "do not rely on this fit yet: " + "; ".join(self.concerns)
+
+    @property
+    def details(self) -> str:
+        """The statistics of the verdict, one in each line."""
         scatter = (
             "the size of the residuals cannot test the fit: the errors were estimated from it, or no degree of freedom is left"
             if math.isnan(self.p_value)
@@ -78,10 +86,9 @@ class Verdict(NamedTuple):
         )
         ended = f"{self.agree} of {self.starts} refined candidates ended at the best minimum"
         others = ", the others fit worse or were stopped early" if self.agree < self.starts else ""
-        lines = [f"  {scatter}", f"  {signs}" if signs else "", f"  {ended}{others}"]
-        lines.append(f"  errors from {self.effective:.0f} effective draws (k-hat {self.k:.2f})")
-        lines += [f"  note: {note}" for note in self.notes]
-        return "\n".join([*filter(None, lines), *(f"  BUT {concern}" for concern in self.concerns)])
+        lines = [scatter, signs, ended + others]
+        lines.append(f"errors from {self.effective:.0f} effective draws (k-hat {self.k:.2f})")
+        return "\n".join(filter(None, [*lines, *(f"note: {note}" for note in self.notes)]))
 
 
 def judge(
@@ -128,8 +135,8 @@ def judge(
             (status != "converged", "the fit has not converged: allow more steps (max_steps), or start closer"),
             (
                 distribution.kind == "none",
-                f"there are no errors and intervals: the exploration ended with {sample.effective:.0f} effective draws "
-                f"(k-hat {sample.k:.2f}); start closer, give bounds or priors, or fix numbers",
+                "there are no errors and intervals, because the exploration ended early: start closer, give bounds or priors, "
+                "or fix numbers",
             ),
             (len(minima) > 1, f"the data allow {len(minima)} minima: " + "; ".join(map(str, minima))),
             (missing, f"the model has no prediction for {missing} measurements: its run ends earlier, or fails"),
@@ -238,16 +245,6 @@ class Profile(NamedTuple):
     deviance: Float[np.ndarray, " points"]
     estimates: dict[str, Float[np.ndarray, " points"]]
     converged: np.ndarray
-
-    def concern(self, name: str) -> str:
-        """Where to start again, if the profile falls below the best fit; otherwise empty. **Arguments:** `name`: name of the
-        parameter."""
-        best = int(np.argmin(self.deviance))
-        return (
-            f"the fit is better with {name} = {self.values[best]:.6g}: start there"
-            if self.deviance[best] < -SAME
-            else ""
-        )
 
 
 def profiled(fit: "Identification", k: int, values: Float[np.ndarray, " points"]) -> Profile:

@@ -212,10 +212,8 @@ class Region(NamedTuple):
         """
         size = len(self.middle)
         root = np.roots([1.0, *np.zeros(size - 1), -1.0, -1.0]).real.max()
-        unit = (
-            np.random.default_rng(seed).uniform(size=size)
-            + np.outer(np.arange(count), root ** -np.arange(1.0, size + 1.0))
-        ) % 1.0
+        shift, steps = np.random.default_rng(seed).uniform(size=size), root ** -np.arange(1.0, size + 1.0)
+        unit = (shift + np.outer(np.arange(count), steps)) % 1.0
         unit[0] = 0.5
         return self.middle + (2.0 * unit - 1.0) * self.half_width
 

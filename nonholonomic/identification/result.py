@@ -8,6 +8,7 @@ shows in few accepted proposals, and in R-hat and ESS (Tierney, Ann. Stat. 22 (1
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -26,12 +27,9 @@ from .conclusions import Distribution, Profile, Verdict, judge, profiled, senten
 from .exploration import ROWS, Explorer, Mixture, Pool, draw_errors
 from .posterior import Free, LogDensity, Measurements, Model, predictions
 from .recording import AbstractRecording, numbered
-from .search import FitWarning, Identifiability, Minima, identifiability, search
+from .search import SAME, FitWarning, Identifiability, Minima, identifiability, search
 
 # The result of a fit: estimates, errors, undetermined combinations, and the outcome of every start.
-
-#: The most likely value is stated where it is farther from the estimate than this part of a standard error.
-NOTICEABLE = 0.1
 
 #: Number of points of a curve, and the greatest number of predictions for each sample.
 POINTS, MOST = 1200, 16
@@ -91,7 +89,6 @@ class Identification:
     - `distribution`: the `Distribution` of the coordinates, with its weighted points.
     - `density`: the `LogDensity` of model and measurements.
     - `series_units`: the unit of each series of the measurements, if known; `units`: name -> unit of a parameter, if known.
-    - `profiles`: index of a parameter -> its profile, once it has been computed.
 
     **Example:** the fit of the subpackage's example.
 
@@ -119,7 +116,6 @@ class Identification:
     distribution: Distribution = dataclasses.field(repr=False)
     density: LogDensity = dataclasses.field(repr=False)
     units: dict[str, str] = dataclasses.field(default_factory=dict)
-    profiles: dict[int, Profile] = dataclasses.field(default_factory=dict, repr=False)
 
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
         """The central interval of a parameter: the likelihood, times the priors, leaves equal probabilities below and
@@ -156,8 +152,6 @@ class Identification:
         missing.
         """
         k = self._place(name)
-        if values is None and k in self.profiles:
-            return self.profiles[k]
         lower, upper = self.density.problem.unknowns.lower[k], self.density.problem.unknowns.upper[k]
         error = self.standard_errors[self.density.problem.names[k]]
         if values is None and not np.isfinite(error):
@@ -169,10 +163,9 @@ class Identification:
         if not np.all((held > lower) & (held < upper)):
             raise ValueError(f"values = {shown(held)} must lie within the bounds ({lower}, {upper}) of {name!r}")
         profile = profiled(self, k, held)
-        if concern := profile.concern(name):
-            warn(concern, FitWarning)
-        if values is None:
-            self.profiles[k] = profile
+        best = int(np.argmin(profile.deviance))
+        if profile.deviance[best] < -SAME:
+            warn(f"the fit is better with {name} = {profile.values[best]:.6g}: start there", FitWarning)
         return profile
 
     @property
@@ -222,7 +215,7 @@ class Identification:
 
     @status_line("drawing")
     def plot(self, unit: str | Sequence[str] | None = None) -> Any:
-        """Data and model, residuals, the profile likelihood of every parameter with its estimate and 95 % interval, and the
+        """Data and model, residuals, the distribution of every parameter with its estimate and 95 % interval, and the
         correlations (needs matplotlib).
 
         **Arguments:** `unit`: unit to draw in, such as "deg" for all angles, or several, such as ("deg", "rpm").
@@ -244,23 +237,52 @@ class Identification:
     _repr_html_ = text_as_html
 
     def __str__(self) -> str:
+        """Values with their 95 % intervals, whether to believe them, and what to do."""
         lines = [
             f"Identification of {counted(len(self.estimates), 'number')} from "
-            f"{counted(len(self.residuals), 'measurement')}: {self.status}",
-            f"  -2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
-            "verdict",
-            str(self.verdict),
-            "estimates, standard errors and 95 % intervals",
+            f"{counted(len(self.residuals), 'measurement')}: {self.status}"
+        ]
+        width = max(map(len, self.estimates))
+        for name in self.estimates:
+            estimate, low, high = self.rounded(name)
+            unit = readable_unit(self.units.get(name, "1"))
+            interval = "undetermined" if np.isinf(self.standard_errors[name]) else "no interval"
+            if np.isfinite(self.standard_errors[name]):
+                interval = f"95 %: {low} to {high}"
+            lines.append(f"  {name:{width}}  {' '.join(filter(None, (estimate, unit)))}  ({interval})")
+        return "\n".join([*lines, f"verdict: {self.verdict}", "the statistics: print(fit.details)"])
+
+    def rounded(self, name: str, factor: float = 1.0) -> tuple[str, str, str]:
+        """The estimate of a parameter and the ends of its 95 % interval, to two digits of the distance to the farther end.
+
+        **Arguments:** `name`: name of the parameter, or the end of its name; `factor`: from its unit to the one that is shown.
+        """
+        numbers = factor * np.array([list(self.estimates.values())[self._place(name)], *self.interval(name)])
+        reach = np.max(np.abs(numbers - numbers[0]))
+        # The place of the last digit, as a power of ten.
+        last = math.floor(math.log10(reach)) - 1 if 0.0 < reach < np.inf else -6
+        digits = np.floor(np.log10(np.maximum(np.abs(numbers), 10.0**last))) - last + 1.0
+        texts = (
+            f"{number:#.{int(count)}g}"
+            for number, count in zip(numbers.tolist(), np.fmin(np.fmax(digits, 1.0), 15.0), strict=True)
+        )
+        estimate, low, high = (text.rstrip(".") for text in texts)
+        return estimate, low, high
+
+    @property
+    def details(self) -> str:
+        """The statistics of the fit: its verdict, estimates with standard errors, the combinations of parameters that the data
+        determine, and the residuals."""
+        lines = [
+            f"-2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
+            self.verdict.details,
+            "estimates, standard errors, most likely values",
         ]
         width = max(map(len, self.estimates))
         for name, value in self.estimates.items():
-            low, high = self.interval(name)
-            unit = readable_unit(self.units.get(name, "1"))
-            error, likely = self.standard_errors[name], self.most_likely[name]
-            text = f"{value:.6g} +- {error:.2g}  ({low:.6g}, {high:.6g}) {unit}".rstrip()
-            # The estimate is another point where the most likely one is far from the mean.
-            differs = abs(value - likely) > NOTICEABLE * error
-            lines.append(f"  {name:{width}}  {text}{f', most likely {likely:.6g}' if differs else ''}")
+            lines.append(
+                f"  {name:{width}}  {value:.6g} +- {self.standard_errors[name]:.2g}, {self.most_likely[name]:.6g}"
+            )
         lines.append("combinations of parameters and their relative errors")
         for value, words in zip(self.identifiability.singular_values, self.identifiability.words, strict=True):
             mark = "  UNDETERMINED" if words in self.identifiability.unseen else ""

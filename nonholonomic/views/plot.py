@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.gridspec import SubplotSpec
 
     from ..identification import Identification
-    from ..identification.conclusions import Profile
     from ..sweeps import Table
 
 #: Colours of map cells without a finite value, one for each status.
@@ -390,10 +389,10 @@ def _columns(names: Sequence[str]) -> int:
     return min(len(names), max(1, WIDTH // (max(map(len, names)) + 6)))
 
 
-# The picture of a fit: data and model, residuals, profile likelihoods and correlations.
+# The picture of a fit: data and model, residuals, distributions and correlations.
 
-#: Greatest number of drawn profiles, and the rise of -2 log likelihood at the end of a 95 % interval.
-MOST_PROFILES, INTERVAL = 6, 3.84
+#: Greatest number of drawn distributions, how far they are drawn in standard deviations of a normal one, and their bars.
+MOST_DISTRIBUTIONS, DEVIATIONS, BARS = 6, 3.5, 30
 
 #: With at most this many measurements without a time, their labels are drawn.
 MOST_LABELS = 12
@@ -451,18 +450,18 @@ class _Drawn(NamedTuple):
 
 def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figure":
     """Draw a fit: measurements and predictions at the most likely values, with a panel for each quantity; residuals in standard
-    errors; profile likelihoods of the determined parameters (with their estimates and intervals, and the parabolas of their
-    errors dashed); and correlations. Samples over time and other measurements are side by side.
+    errors; distributions of the determined parameters, with their estimates and intervals; and correlations. Samples over time
+    and other measurements are side by side.
 
     **Arguments:** `labels`: (n,), short names of the measurements; `unit`: as for `in_unit`.
 
     **Returns:** a matplotlib figure.
     """
     names, drawn, times = list(fit.estimates), _Drawn.of(fit, unit), np.asarray(fit.density.measurements.time)
-    profiled = [name for name in names if np.isfinite(fit.standard_errors[name])][:MOST_PROFILES]
+    determined = [name for name in names if np.isfinite(fit.standard_errors[name])][:MOST_DISTRIBUTIONS]
     # The correlations of one number say nothing.
     correlated = len(names) > 1
-    lower = len(profiled) + correlated or 1
+    lower = len(determined) + correlated or 1
     has_time = [bool(np.any(times[indices])) for indices in drawn.series]
     blocks = [
         [k for k, timed in enumerate(has_time) if timed == wanted] for wanted in (True, False) if wanted in has_time
@@ -474,11 +473,8 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figur
     for column, block in enumerate(blocks):
         _draw_block(fit, drawn, block, has_time[block[0]], labels, figure, columns[column])
     grid = rows[1].subgridspec(1, lower)
-    concerns = [*fit.verdict.concerns]
-    for k, name in enumerate(profiled):
-        profile = fit.profile(name)
-        _draw_profile(fit, name, profile, figure.add_subplot(grid[k]), unit)
-        concerns += filter(None, [profile.concern(name)])
+    for k, name in enumerate(determined):
+        _draw_distribution(fit, name, figure.add_subplot(grid[k]), unit)
     if correlated:
         axes, short = figure.add_subplot(grid[lower - 1]), list(short_names(names).values())
         image = axes.imshow(fit.correlation, vmin=-1.0, vmax=1.0, cmap="RdBu")
@@ -486,8 +482,7 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figur
         axes.set_yticks(range(len(names)), short, fontsize=8)
         axes.set_title("correlation", fontsize=9)
         figure.colorbar(image, ax=axes, shrink=0.8)
-    remarks = [*(concerns or ["no concerns about this fit"]), *(f"note: {note}" for note in fit.verdict.notes)]
-    figure.suptitle("; ".join(remarks), fontsize=9, wrap=True)
+    figure.suptitle(str(fit.verdict), fontsize=10, wrap=True)
     return figure
 
 
@@ -582,24 +577,25 @@ def _draw_limits(axes: "Axes", places: np.ndarray, lower: np.ndarray, upper: np.
     axes.set_ylim(low, high)
 
 
-def _draw_profile(fit: "Identification", name: str, profile: "Profile", axes: "Axes", unit: Unit) -> None:
+def _draw_distribution(fit: "Identification", name: str, axes: "Axes", unit: Unit) -> None:
+    """The probability of the values of one parameter: of a linear model a normal distribution, otherwise that of the weighted
+    points of the exploration."""
     shown, factor = in_unit(fit.units.get(name, "1"), unit)
-    estimate, error = fit.estimates[name], fit.standard_errors[name]
-    likely = fit.most_likely[name]
-    values, deviance = np.append(profile.values, likely), np.append(profile.deviance, 0.0)
-    order = np.argsort(values)
-    axes.plot(factor * values[order], deviance[order], ".-", label="profile")
-    axes.plot(
-        factor * values[order], ((values[order] - estimate) / error) ** 2, "--", color="0.6", label="standard error"
-    )
-    axes.axhline(INTERVAL, color="0.6", linewidth=0.8)
+    estimate, low, high = fit.rounded(name, factor)
+    ends, distribution = fit.interval(name, DEVIATIONS), fit.distribution
+    if distribution.kind == "weights":
+        used = distribution.weights > 0.0
+        values = fit.density.problem.unknowns.values(distribution.points[used])[:, list(fit.estimates).index(name)]
+        edges = factor * np.linspace(*ends, BARS + 1)
+        axes.hist(factor * np.asarray(values), edges, weights=distribution.weights[used], color="C0", alpha=0.7)
+    else:
+        deviations = np.linspace(-DEVIATIONS, DEVIATIONS, 101)
+        axes.plot(factor * np.linspace(*ends, 101), np.exp(-0.5 * deviations**2), color="C0")
     axes.axvspan(*(factor * end for end in fit.interval(name)), color="0.92", zorder=0, label="95 %")
-    if name == next(iter(fit.estimates)):
-        axes.legend(fontsize=7, loc="upper right")
+    axes.axvline(factor * fit.estimates[name], color="0.3", linewidth=1.0)
     axes.locator_params(axis="x", nbins=4)
-    axes.set_ylim(-0.5, 10.0)
+    axes.set_ylim(0.0)
+    axes.set_yticks([])
     axes.set_xlabel(_with_unit(short_names(list(fit.estimates))[name], shown))
-    axes.set_ylabel("-2 log likelihood, profiled")
-    digits = max(0, 1 - math.floor(math.log10(factor * error)))
-    value, spread, low, high = (f"{factor * part:.{digits}f}" for part in (estimate, error, *fit.interval(name)))
-    axes.set_title(f"{value} ± {spread} {readable_unit(shown)}".rstrip() + f"\n95 %: {low} to {high}", fontsize=9)
+    axes.set_ylabel("probability")
+    axes.set_title(f"{estimate} {readable_unit(shown)}".rstrip() + f"\n95 %: {low} to {high}", fontsize=9)

@@ -187,7 +187,7 @@ def test_a_direction_that_the_data_cannot_see_is_named():
     assert np.isinf(fit.standard_errors["b"])
     assert fit.standard_errors["c"] < 0.01
     assert_close(fit.estimates["a"] * fit.estimates["b"], 6.0, rtol=1e-6)
-    assert "UNDETERMINED" in str(fit)
+    assert "UNDETERMINED" in fit.details
     with pytest.raises(ValueError, match="'a', whose standard error is infinite"):
         fit.profile("a")
     assert_close(coordinate_covariance(np.array([[2.0, 0.0]])), [[0.25, 0.0], [0.0, np.inf]])
