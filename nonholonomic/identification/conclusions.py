@@ -68,27 +68,10 @@ class Verdict(NamedTuple):
         return not self.concerns
 
     def __str__(self) -> str:
-        """Whether to believe the fit, and what to do; `details` has the statistics behind it."""
+        """Whether to believe the fit, and what to do; `Identification.details` has the statistics."""
         if self.good:
             return "no concerns about this fit"
         return "do not rely on this fit yet: " + "; ".join(self.concerns)
-
-    @property
-    def details(self) -> str:
-        """The statistics of the verdict, one in each line."""
-        scatter = (
-            "the size of the residuals cannot test the fit: the errors were estimated from it, or no degree of freedom is left"
-            if math.isnan(self.p_value)
-            else f"residuals this large have a probability of {self.p_value:.2g}"
-        )
-        signs = ", ".join(
-            f"{series.runs} runs of {series.count} signs (p = {series.p_value:.2g})" for series in self.series
-        )
-        ended = f"{self.agree} of {self.starts} refined candidates ended at the best minimum"
-        others = ", the others fit worse or were stopped early" if self.agree < self.starts else ""
-        lines = [scatter, signs, ended + others]
-        lines.append(f"errors from {self.effective:.0f} effective draws (k-hat {self.k:.2f})")
-        return "\n".join(filter(None, [*lines, *(f"note: {note}" for note in self.notes)]))
 
 
 def judge(

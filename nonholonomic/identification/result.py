@@ -87,8 +87,8 @@ class Identification:
     - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
     - `distribution`: the `Distribution` of the coordinates, with its weighted points.
-    - `density`: the `LogDensity` of model and measurements.
-    - `series_units`: the unit of each series of the measurements, if known; `units`: name -> unit of a parameter, if known.
+    - `density`: the `LogDensity` of model and measurements; `density.series_units`: the unit of each series, if known.
+    - `units`: name -> unit of a parameter, if known.
 
     **Example:** the fit of the subpackage's example.
 
@@ -201,11 +201,6 @@ class Identification:
         return np.stack(times), np.stack(values)
 
     @property
-    def series_units(self) -> tuple[str, ...]:
-        """The unit of each series of the measurements, if known."""
-        return self.density.series_units
-
-    @property
     def correlation(self) -> Float[np.ndarray, "unknowns unknowns"]:
         """Correlations of the estimates, in the coordinates of the fit; 0 for estimates with infinite error."""
         errors = np.sqrt(np.diag(self.coordinate_covariance))
@@ -262,10 +257,8 @@ class Identification:
         # The place of the last digit, as a power of ten.
         last = math.floor(math.log10(reach)) - 1 if 0.0 < reach < np.inf else -6
         digits = np.floor(np.log10(np.maximum(np.abs(numbers), 10.0**last))) - last + 1.0
-        texts = (
-            f"{number:#.{int(count)}g}"
-            for number, count in zip(numbers.tolist(), np.fmin(np.fmax(digits, 1.0), 15.0), strict=True)
-        )
+        counts = np.fmin(np.fmax(digits, 1.0), 15.0).astype(int).tolist()
+        texts = (f"{number:#.{count}g}" for number, count in zip(numbers.tolist(), counts, strict=True))
         estimate, low, high = (text.rstrip(".") for text in texts)
         return estimate, low, high
 
@@ -273,9 +266,20 @@ class Identification:
     def details(self) -> str:
         """The statistics of the fit: its verdict, estimates with standard errors, the combinations of parameters that the data
         determine, and the residuals."""
+        verdict, count = self.verdict, self.verdict.starts
+        scatter = f"residuals this large have a probability of {verdict.p_value:.2g}"
+        if math.isnan(verdict.p_value):
+            scatter = (
+                "residuals cannot test the fit: the errors were estimated from it, or no degree of freedom is left"
+            )
         lines = [
             f"-2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
-            self.verdict.details,
+            scatter,
+            *(f"{order.runs} runs of {order.count} signs (p = {order.p_value:.2g})" for order in verdict.series),
+            f"{verdict.agree} of {count} refined candidates ended at the best minimum"
+            + (", the others fit worse or were stopped early" if verdict.agree < count else ""),
+            f"errors from {verdict.effective:.0f} effective draws (k-hat {verdict.k:.2f})",
+            *(f"note: {note}" for note in verdict.notes),
             "estimates, standard errors, most likely values",
         ]
         width = max(map(len, self.estimates))

@@ -425,7 +425,7 @@ class _Drawn(NamedTuple):
         series, factors = [np.flatnonzero(numbers == number) for number in np.unique(numbers)], np.ones(len(numbers))
         for k, indices in enumerate(series):
             label = fit.residuals[indices[0]].label
-            si = fit.series_units[k] if k < len(fit.series_units) else "1"
+            si = fit.density.series_units[k] if k < len(fit.density.series_units) else "1"
             quantity = label.partition("(")[0] if "(" in label else "time" if si == "s" else "measured"
             shown, factors[indices] = in_unit(si, unit)
             names.append(_with_unit(quantity, shown))

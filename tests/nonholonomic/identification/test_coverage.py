@@ -52,7 +52,7 @@ def test_intervals_cover_the_truth_on_a_staircase(slopes):
     by_slopes = sum(abs(fit.most_likely["rate"] - truth) < 1.96 * fit.slope_errors["rate"] for truth, fit in results)
     if slopes == "exact":
         assert by_slopes < 18
-    assert sum("slopes understate the errors" in fit.verdict.details for _, fit in results) >= 12
+    assert sum("slopes understate the errors" in fit.details for _, fit in results) >= 12
     assert all(fit.verdict.effective >= 400.0 and fit.verdict.k < 0.7 for _, fit in results)
 
 

@@ -106,7 +106,7 @@ def test_the_picture_of_a_fit_has_the_units_of_the_quantities():
     assert "theta" in run
     assert "tetha" not in run
     fit = nonholonomic.identify(scene, data, {"launch.spin": 155.0}, starts=2, progress=False)
-    assert fit.series_units == ("rad", "rad/s", "m")
+    assert fit.density.series_units == ("rad", "rad/s", "m")
     figure = fit.plot(unit=("deg", "rpm", "mm"))
     assert isinstance(figure, matplotlib.figure.Figure)
     labels = ["theta [deg]", "spin [rpm]", "position.z [mm]", "residual\n[standard errors]"]
