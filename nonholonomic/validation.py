@@ -306,17 +306,15 @@ def require_file(path: object, name: str, *endings: str) -> Path:
 
 
 @contextlib.contextmanager
-def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
+def replacing(path: Path) -> Iterator[Path]:
     """A new file that replaces `path` at the end of the context, completely or not at all. If `path` is a symbolic link,
     the new file replaces the file to which it points.
-
-    **Arguments:** `folder`: the folder of the new file until then, by default that of `path`.
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
     target = real_path(path)
     # The ending tells the kind of a file to its writer.
-    scratch = (folder or target.parent) / f"{path.name}.{uuid.uuid4().hex}.part{path.suffix}"
+    scratch = target.parent / f"{path.name}.{uuid.uuid4().hex}.part{path.suffix}"
     try:
         if target.is_dir():
             raise OSError(0, "it is a folder")

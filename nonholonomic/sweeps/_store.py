@@ -1,11 +1,13 @@
-"""The file of a table, and the files of the chunks of an unfinished one.
+"""The file of a table, finished or not.
 
 A table's file is HDF5 with dimension scales, as in netCDF-4, so that xarray opens it with named coordinates. Words, such as
 a cell's status, are stored as bytes with the attributes `flag_values` and `flag_meanings` (CF conventions). Checksums
 cover every number: HDF5 has one for the description of the arrays, and the group `checksums`, which xarray does not
 show, has one for each chunk of each variable. A file appears only when it is complete.
 
-Until then, each finished chunk has its own file, in a folder beside the table's file, so that a killed sweep can resume.
+A sweep fills a file in a folder beside it, chunk by chunk, so that a killed sweep can resume. The file has room for all
+numbers from the beginning, and HDF5 never writes it again. A chunk is finished when it is marked so, in one byte, after its
+numbers and checksums are on disk.
 """
 
 import contextlib
@@ -30,7 +32,7 @@ import numpy as np
 
 from ..integration.problem import FORMER_WORDS
 from ..validation import as_path, real_path, replacing, sync_folder, warn
-from .grid import EQUATIONS, PENDING, Layout, Values, axes_of, boxes
+from .grid import EQUATIONS, PENDING, Layout, Values, axes_of
 
 if TYPE_CHECKING:
     import h5py
@@ -38,14 +40,14 @@ if TYPE_CHECKING:
 #: The group of the checksums.
 CHECKSUMS = "checksums"
 
+#: The array of a byte for each chunk, in the same group: not 0 when the chunk is finished.
+FINISHED = "finished chunks"
+
 #: Attributes that describe the file and not its table; earlier versions wrote the last two.
 OF_THE_FILE = ("Conventions", "inner", "long_names")
 
 #: Variables of tables larger than this [bytes] are read only when needed.
 MAX_BYTES_IN_MEMORY = 1 << 27
-
-#: No compression of HDF5 makes numbers smaller by a greater factor.
-MAX_COMPRESSION = 2000
 
 
 #: Endings of files in other formats, which a table's file must not have.
@@ -67,41 +69,44 @@ def table_path(path: object) -> Path:
     return file
 
 
-def write_file(
-    path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values]]], folder: Path | None = None
-) -> None:
+def write_file(path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values]]]) -> None:
     """Write a table completely or not at all; an existing file is replaced.
 
-    **Arguments:** `chunks`: the index of a chunk and its cells by variable, in any order; without chunks, the file only
-    describes the table. `folder`: as for `replacing`.
+    **Arguments:** `chunks`: the index of a chunk and its cells by variable, in any order; other chunks stay unfinished.
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
-    # The import takes a tenth of a second, and most processes do not need it.
-    import h5py
+    with replacing(path) as scratch, Stream(scratch, "r+b") as stream:
+        places = _describe(stream, layout)
+        for chunk, values in chunks:
+            write_chunk(stream, layout, places, chunk, values)
 
-    with replacing(path, folder) as scratch, Stream(scratch, "r+b") as stream:
-        with h5py.File(stream, "w", libver=("v110", "v110"), track_order=True) as file:
-            _describe(file, layout)
-            group = file.create_group(CHECKSUMS)
-            group.attrs["block"] = layout.chunk
-            sums = {name: np.zeros(layout.chunks, np.uint32) for name in layout.kinds}
-            for chunk, values in chunks:
-                for name, kind in layout.kinds.items():
-                    cells = np.ascontiguousarray(values[name], kind)
-                    sums[name][chunk] = zlib.crc32(cells.data)
-                    array, start = cast("h5py.Dataset", file[name]), 0
-                    for box in boxes(layout.shape, *layout.ends(chunk)):
-                        sizes = [part.stop - part.start for part in box]
-                        stop = start + math.prod(sizes)
-                        array[box] = cells[start:stop].reshape((*sizes, *cells.shape[1:]))
-                        start = stop
-                stream.check()
-            for name in layout.coords:
-                sums[name] = np.array([zlib.crc32(cast("h5py.Dataset", file[name])[()])], np.uint32)
-            for name, values in sums.items():
-                group.create_dataset(name, data=values)
-        stream.check()
+
+def write_chunk(
+    stream: "Stream",
+    layout: Layout,
+    places: dict[str, int],
+    chunk: int,
+    values: dict[str, Values],
+    synced: bool = False,
+) -> None:
+    """Write the numbers of a chunk and their checksums, and mark it as finished when they are on disk.
+
+    **Arguments:** `places`: where the file has the numbers of its arrays; `synced`: whether to wait for the disk.
+
+    **Raises:** `OSError` if that fails.
+    """
+    first, _ = layout.ends(chunk)
+    for name, kind in layout.kinds.items():
+        cells = np.ascontiguousarray(values[name], kind)
+        stream.seek(places[name] + layout.bytes_of_cells(first, name))
+        stream.write(cells.tobytes())
+        stream.seek(places[f"{CHECKSUMS}/{name}"] + 4 * chunk)
+        stream.write(zlib.crc32(cells.data).to_bytes(4, "little"))
+    stream.check(synced)
+    stream.seek(places[f"{CHECKSUMS}/{FINISHED}"] + chunk)
+    stream.write(b"\xff")
+    stream.check(synced)
 
 
 class Stream(io.FileIO):
@@ -127,33 +132,51 @@ class Stream(io.FileIO):
             self.error = error
             return size or 0
 
-    def check(self) -> None:
-        """Raise the first error, if any."""
+    def check(self, synced: bool = False) -> None:
+        """Raise the first error, if any; `synced`: otherwise, wait until all data are on disk."""
         if self.error is not None:
             raise self.error
+        if synced:
+            os.fsync(self.fileno())
 
 
-def _describe(file: "h5py.File", layout: Layout) -> None:
-    """Write everything in a table except the numbers of its variables."""
-    for name, value in (layout.attributes | {"Conventions": "CF-1.10"}).items():
-        _set(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
-    meanings = dict(layout.words)
-    for name, values in layout.coords.items():
-        if values.dtype.kind == "U":
-            meanings[name], values = tuple(values.tolist()), np.arange(len(values), dtype=np.int8)
-        file.create_dataset(name, data=values).make_scale(name)
-    for name, kind in layout.kinds.items():
-        array = file.create_dataset(name, shape=layout.shape + layout.inner_shape(name), dtype=kind)
-        for axis, coordinate in enumerate((*axes_of(layout.coords, layout.inner), *layout.inner.get(name, ()))):
-            array.dims[axis].attach_scale(file[coordinate])
-    for name in (*layout.coords, *layout.kinds):
-        if name in meanings:
-            file[name].attrs["flag_values"] = np.arange(len(meanings[name]), dtype=np.int8)
-            _set(file[name], "flag_meanings", " ".join(meanings[name]))
-        else:
-            _set(file[name], "units", layout.units.get(name, "1"))
-        if name in layout.long_names:
-            _set(file[name], "long_name", layout.long_names[name])
+def _describe(stream: Stream, layout: Layout) -> dict[str, int]:
+    """Write everything in a table except the numbers of its variables; where the file has room for these."""
+    # The import takes a tenth of a second, and most processes do not need it.
+    import h5py
+
+    with h5py.File(stream, "w", libver=("v110", "v110"), track_order=True) as file:
+        for name, value in (layout.attributes | {"Conventions": "CF-1.10"}).items():
+            _set(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
+        checksums = file.create_group(CHECKSUMS)
+        checksums.attrs["block"] = layout.chunk
+        meanings = dict(layout.words)
+        for name, values in layout.coords.items():
+            if values.dtype.kind == "U":
+                meanings[name], values = tuple(values.tolist()), np.arange(len(values), dtype=np.int8)
+            scale = file.create_dataset(name, data=values)
+            scale.make_scale(name)
+            checksums.create_dataset(name, data=np.array([zlib.crc32(scale[()])], "<u4"))
+        for name, kind in layout.kinds.items():
+            array = file.create_dataset(name, shape=layout.shape + layout.inner_shape(name), dtype=kind)
+            for axis, coordinate in enumerate((*axes_of(layout.coords, layout.inner), *layout.inner.get(name, ()))):
+                array.dims[axis].attach_scale(file[coordinate])
+            if array.size:
+                # The first number that HDF5 writes makes room for all.
+                array[(0,) * array.ndim] = 0
+            checksums.create_dataset(name, data=np.zeros(layout.chunks, "<u4"))
+        checksums.create_dataset(FINISHED, data=np.zeros(layout.chunks, np.uint8))
+        for name in (*layout.coords, *layout.kinds):
+            if name in meanings:
+                file[name].attrs["flag_values"] = np.arange(len(meanings[name]), dtype=np.int8)
+                _set(file[name], "flag_meanings", " ".join(meanings[name]))
+            else:
+                _set(file[name], "units", layout.units.get(name, "1"))
+            if name in layout.long_names:
+                _set(file[name], "long_name", layout.long_names[name])
+        places = _places(file)
+    stream.check()
+    return places
 
 
 def _set(node: "h5py.HLObject", name: str, value: object) -> None:
@@ -168,15 +191,19 @@ def _set(node: "h5py.HLObject", name: str, value: object) -> None:
         node.attrs.create(name, value)
 
 
-def _values(group: "h5py.Group", name: str, box: tuple[slice, ...] = ()) -> Values:
-    """The numbers of a variable, or those within a box.
+def _places(file: "h5py.File") -> dict[str, int]:
+    """Where a file has the numbers of its arrays, by name [bytes].
 
-    **Raises:** `ValueError` if there cannot be as many numbers in the file: reading them could take all memory.
+    **Raises:** `ValueError` for an array that is not there in one piece: reading more numbers could take all memory.
     """
-    array = cast("h5py.Dataset", group[name])
-    if array.nbytes > MAX_COMPRESSION * group.file.id.get_filesize():
-        raise ValueError(f"{name} has {array.size} numbers, more than fit into the file")
-    return np.asarray(array[box])
+    places, checksums = {}, cast("h5py.Group", file[CHECKSUMS])
+    for name in (*(name for name in file if name != CHECKSUMS), *(f"{CHECKSUMS}/{name}" for name in checksums)):
+        array = cast("h5py.Dataset", file[name])
+        place = array.id.get_offset()
+        if array.size and (place is None or place + array.nbytes > file.id.get_filesize()):
+            raise ValueError(f"{name} has {array.size} numbers, more than fit into the file")
+        places[name] = place or 0
+    return places
 
 
 def _attribute(node: "h5py.HLObject", name: str, is_text: bool = False) -> Any:
@@ -191,7 +218,7 @@ def _attribute(node: "h5py.HLObject", name: str, is_text: bool = False) -> Any:
 class Stored(Mapping[str, Values]):
     """The variables of a table that stays in its file: each is read, and checked against its checksums, when needed.
 
-    `path`: the file; `layout`: its contents.
+    `path`: the file; `layout`: its contents; `places`: where its numbers are; `finished`: the finished chunks.
     """
 
     def __init__(self, path: Path):
@@ -199,13 +226,22 @@ class Stored(Mapping[str, Values]):
 
         **Raises:** `OSError` that names the path if it cannot be read or holds no table.
         """
+        # The import takes a tenth of a second, and most processes do not need it.
+        import h5py
+
         if not path.exists():
             raise FileNotFoundError(f"no such file: {path}")
         if path.is_dir():
             raise OSError(f"cannot read {path}: it is a folder")
         self.path = path
-        with self._opened() as file:
-            self.layout, self._sums = _contents(file)
+        try:
+            with h5py.File(path, "r") as file:
+                self.layout, self._sums, self.places = _contents(file)
+        # What a damaged file makes HDF5 and NumPy raise can be of any kind.
+        except Exception as error:
+            reason = f"it is not a table of nonholonomic, or it is damaged ({error or type(error).__name__})"
+            raise OSError(f"cannot read {path}: {reason}") from None
+        self.finished = set(np.flatnonzero(self._sums[FINISHED]).tolist())
 
     def __getitem__(self, name: str) -> Values:
         if name not in self:
@@ -223,53 +259,41 @@ class Stored(Mapping[str, Values]):
         return len(self.layout.kinds)
 
     def whole(self, name: str) -> Values:
-        """A variable of all cells, which are along the first axis.
+        """A variable of all cells, which are along the first axis; as `Layout.empty` where chunks are not finished.
 
         **Raises:** `OSError` that names the path if numbers do not match their checksums.
         """
-        with self._opened() as file:
-            values, sums = _values(file, name), self._sums[name]
-            if name in self.layout.words and np.any((values < PENDING) | (values >= len(self.layout.words[name]))):
-                raise ValueError(f"{name} has codes without a word")
-        values = values.reshape(-1, *self.layout.inner_shape(name))
-        parts = [np.ascontiguousarray(values[slice(*self.layout.ends(chunk))]) for chunk in range(self.layout.chunks)]
-        damaged = sum(zlib.crc32(part.data) != right for part, right in zip(parts, sums, strict=True))
+        values, damaged = self._cells(name, 0, self.layout.cells), 0
+        for chunk in range(self.layout.chunks):
+            part = values[slice(*self.layout.ends(chunk))]
+            if chunk in self.finished:
+                damaged += zlib.crc32(part.data) != self._sums[name][chunk]
+            else:
+                part[...] = self.layout.empty(1)[name]
         if damaged:
-            raise OSError(
-                f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.chunks} chunks do not match their "
-                "checksums"
-            )
+            reason = f"{damaged} of its {self.layout.chunks} chunks do not match their checksums"
+            raise OSError(f"cannot read {self.path}: it is damaged: {reason}")
+        if name in self.layout.words and np.any((values < PENDING) | (values >= len(self.layout.words[name]))):
+            raise OSError(f"cannot read {self.path}: it is damaged: {name} has codes without a word")
         return values
 
     def chunk(self, chunk: int) -> dict[str, Values] | None:
         """The variables of one chunk; `None` if its numbers do not match their checksums."""
-        first, end = self.layout.ends(chunk)
-        variables = {}
-        with self._opened() as file:
-            for name in self.layout.kinds:
-                parts = [_values(file, name, box) for box in boxes(self.layout.shape, first, end)]
-                shape = self.layout.inner_shape(name)
-                variables[name] = np.concatenate([part.reshape(-1, *shape) for part in parts])
-                if zlib.crc32(variables[name].data) != self._sums[name][chunk]:
-                    return None
-        return variables
+        variables = {name: self._cells(name, *self.layout.ends(chunk)) for name in self.layout.kinds}
+        are_right = all(zlib.crc32(values.data) == self._sums[name][chunk] for name, values in variables.items())
+        return variables if are_right else None
 
-    @contextlib.contextmanager
-    def _opened(self) -> Iterator["h5py.File"]:
-        # Only files need it.
-        import h5py
-
+    def _cells(self, name: str, first: int, end: int) -> Values:
+        shape = (end - first, *self.layout.inner_shape(name))
+        place = self.places[name] + self.layout.bytes_of_cells(first, name)
         try:
-            with h5py.File(self.path, "r") as file:
-                yield file
-        # What a damaged file makes HDF5 and NumPy raise can be of any kind.
-        except Exception as error:
-            reason = f"it is not a table of nonholonomic, or it is damaged ({error or type(error).__name__})"
-            raise OSError(f"cannot read {self.path}: {reason}") from None
+            return np.fromfile(self.path, self.layout.kinds[name], math.prod(shape), offset=place).reshape(shape)
+        except (OSError, ValueError) as error:
+            raise OSError(f"cannot read {self.path}: {error}") from None
 
 
-def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
-    """A file's layout, and its checksums by variable."""
+def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values], dict[str, int]]:
+    """A file's layout, its checksums, and where the numbers of its variables are."""
     coords, kinds, units, words, inner, shapes, long_names = {}, {}, {}, {}, {}, {}, {}
     if "request" not in file.attrs:
         raise ValueError("it names no request")
@@ -278,7 +302,8 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
         if not isinstance(json.loads(attributes.get(name, "{}")), dict):
             raise ValueError(f"the attribute {name} is not a dictionary")
     axes, checksums = json.loads(attributes["axes"]), cast("h5py.Group", file[CHECKSUMS])
-    sums = {name: _values(checksums, name) for name in map(str, checksums)}
+    places = _places(file)
+    sums = {name: np.asarray(checksums[name]) for name in map(str, checksums)}
     for name in (*axes, *(name for name in map(str, file) if name not in (*axes, CHECKSUMS))):
         array = cast("h5py.Dataset", file[name])
         if "long_name" in array.attrs:
@@ -292,7 +317,7 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
         else:
             units[name] = _attribute(array, "units", is_text=True)
         if array.is_scale:
-            coords[name] = _values(file, name)
+            coords[name] = np.asarray(array)
             if coords[name].ndim != 1:
                 raise ValueError(f"{name} is not a list of numbers")
             if [zlib.crc32(coords[name])] != sums[name].tolist():
@@ -308,31 +333,28 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     layout = Layout(coords, kinds, units, attributes, words, inner, int(_attribute(checksums, "block")), long_names)
     if layout.chunk < 1:
         raise ValueError(f"its chunks have {layout.chunk} cells")
-    for name, shape in shapes.items():
-        if shape != layout.shape + layout.inner_shape(name) or len(sums[name]) != layout.chunks:
+    # Files of earlier versions hold finished tables alone.
+    sums.setdefault(FINISHED, np.ones(layout.chunks, np.uint8))
+    for name in (*kinds, FINISHED):
+        shape = layout.shape + layout.inner_shape(name)
+        if shapes.get(name, shape) != shape or len(sums[name]) != layout.chunks:
             raise ValueError(f"{name} has the wrong shape")
-    return layout, sums
+    return layout, sums, places
 
 
-# The chunks of an unfinished table.
+# The file of an unfinished table.
 
-#: The files of the folder of a table's chunks, besides those of the chunks: a table without numbers, and the lock.
-HEADER, LOCK = "table.h5", "nonholonomic.lock"
+#: The files in the folder of an unfinished table: the table, and the lock.
+UNFINISHED, LOCK = "table.h5", "nonholonomic.lock"
 
 #: The name of a file in the folder that was not finished, as `replacing` names it.
 PART = re.compile(r".+\.[0-9a-f]{32}\.part(\.[^.]*)?")
 
 
 def folder_of(path: Path) -> Path:
-    """The folder of a table's chunks while it is computed, beside the file itself, not beside a link to it."""
+    """The folder of an unfinished table, beside the table's file itself, not beside a link to it."""
     path = real_path(path)
     return path.with_name(path.name + ".blocks")
-
-
-def chunks_in(folder: Path, layout: Layout) -> set[int]:
-    """The chunks of a table whose files are in its folder."""
-    chunks = {int(file.stem) for file in folder.glob("*.npz") if file.stem.isdecimal()}
-    return {chunk for chunk in chunks if chunk < layout.chunks}
 
 
 class AnotherRun(ValueError):
@@ -361,13 +383,14 @@ class ChunkStore:
     """
 
     def __init__(self, path: object, layout: Layout):
-        """Find the chunks of an earlier run of the same request, or create a folder for new ones.
+        """Find the chunks of an earlier run of the same request, or create a file for new ones.
 
         **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
         difference if it holds the result of another request or of another version of this package.
         """
         self.path = table_path(path)
         self.folder, self.layout, self._lock = folder_of(self.path), layout, None
+        self._unfinished = self.folder / UNFINISHED
         try:
             self._lock = self._locked()
             self._find()
@@ -379,108 +402,91 @@ class ChunkStore:
         for file in list(self.folder.iterdir()):
             if PART.fullmatch(file.name):
                 file.unlink()
-        stored = Stored(self.path) if self.path.exists() else None
-        header = self.folder / HEADER
-        table = Stored(header) if stored is None and header.exists() else stored
-        if table is not None:
+        tables = [Stored(file) for file in (self._unfinished, self.path) if file.exists()]
+        for table in tables:
             difference = difference_between(table.layout, self.layout)
             if difference is not None:
-                raise AnotherRun(self.path if table is stored else self.folder, difference)
+                raise AnotherRun(self.path if table.path == self.path else self.folder, difference)
             old, new = table.layout.versions, self.layout.versions
             changed = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
-            if changed and stored is None:
+            if changed and not self.path.exists():
                 versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
                 warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning)
-            # The table records the versions with which it was begun; words added since then follow its own words.
-            words = dict(table.layout.words)
-            for name, own_words in words.items():
-                new_words = self.layout.words.get(name, ())
-                words[name] = new_words if new_words[: len(own_words)] == own_words else own_words
-            self.layout = table.layout._replace(words=words)
-        valid = {chunk for chunk in range(self.layout.chunks) if stored is not None and stored.chunk(chunk) is not None}
-        self._whole = len(valid) == self.layout.chunks
-        if self._whole:
-            self.finished = valid
+        if tables:
+            # The table records the versions with which it was begun.
+            self.layout = tables[-1].layout
+        valid = [{chunk for chunk in table.finished if table.chunk(chunk) is not None} for table in tables]
+        self.finished = set().union(*valid)
+        self._is_whole = self.path.exists() and len(valid[-1]) == self.layout.chunks
+        if self._is_whole:
             return
-        if not header.exists():
-            self._begin(header)
-        chunks_on_disk = chunks_in(self.folder, self.layout)
-        damaged = {chunk for chunk in chunks_on_disk if read_chunk(self.folder, self.layout, chunk) is None}
-        self.finished = chunks_on_disk - damaged
-        if stored is not None:
-            damaged |= set(range(self.layout.chunks)) - valid - self.finished
-            for chunk in sorted(valid - self.finished):
-                values = stored.chunk(chunk)
-                assert values is not None
-                self.write(chunk, values)
-            self.finished |= valid
+        if [table.path for table in tables] != [self._unfinished]:
+            self._begin(tables)
+        self._places = Stored(self._unfinished).places
+        damaged = {chunk for table in tables for chunk in table.finished} - self.finished
         if damaged:
             warn(
                 f"{self.path} is damaged: {len(damaged)} finished chunks do not match their checksums and are computed again",
                 RuntimeWarning,
             )
 
-    def _begin(self, header: Path) -> None:
-        """Write a note about the folder's purpose, unless the folder is somebody else's."""
-        foreign = [file.name for file in self.folder.iterdir() if file.name != LOCK]
-        if foreign:
+    def _begin(self, tables: list[Stored]) -> None:
+        """Create the file of the chunks, with those of other files, unless its folder is somebody else's."""
+        foreign = [file.name for file in self.folder.iterdir() if file.name not in (LOCK, UNFINISHED)]
+        if foreign and not self._unfinished.exists():
             raise OSError(
                 f"cannot write {self.path}: the folder of its chunks, {self.folder}, holds other files, such as {foreign[0]}; "
                 "give another path, or move them"
             )
-        # The chunks remain until the table's file exists.
-        bytes_needed = 2 * self.layout.bytes_of_cells(self.layout.cells)
+        bytes_needed = self.layout.bytes_of_cells(self.layout.cells)
         try:
             room = shutil.disk_usage(self.folder).free
             sync_folder(self.folder.parent)
         except OSError as error:
             raise OSError(f"cannot write {self.path}: {error.strerror}") from None
         if room < bytes_needed:
-            sizes = (
-                f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * bytes_needed:.3g} GB while it is computed"
-            )
+            sizes = f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * bytes_needed:.3g} GB"
             raise OSError(f"cannot write {self.path}: {sizes}")
-        write_file(header, self.layout, ())
+        chunks = (
+            (chunk, values)
+            for table in tables
+            for chunk in table.finished
+            if (values := table.chunk(chunk)) is not None
+        )
+        write_file(self._unfinished, self.layout, chunks)
 
     def fill(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> None:
-        """Store each chunk when it is computed, and write the table's file from these and from the existing chunks.
+        """Store each chunk when it is computed; then the file has all chunks, and becomes the table's file.
 
-        Chunks that are written to the file during the computation need not be read again at the end.
-
-        **Raises:** `OSError` that names the path if it cannot be written, or a chunk that is damaged; no chunk is lost.
+        **Raises:** `OSError` that names the path if it cannot be written; no chunk is lost.
         """
-        if not self._whole:
-            write_file(self.path, self.layout, self._all(computed), self.folder)
-        for chunk in chunks_in(self.folder, self.layout):
-            (self.folder / f"{chunk}.npz").unlink(missing_ok=True)
-        (self.folder / HEADER).unlink(missing_ok=True)
-
-    def _all(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Iterator[tuple[int, dict[str, Values]]]:
+        if self._is_whole:
+            self._unfinished.unlink(missing_ok=True)
+            return
         for chunk, values in computed:
             self.write(chunk, values)
-            yield chunk, values
-        for chunk in sorted(self.finished):
-            values_on_disk = read_chunk(self.folder, self.layout, chunk)
-            if values_on_disk is None:
-                raise OSError(f"cannot read {self.folder}: chunk {chunk} is damaged; the same call computes it again")
-            yield chunk, values_on_disk
+        target = real_path(self.path)
+        try:
+            os.replace(self._unfinished, target)
+            sync_folder(target.parent)
+        except OSError as error:
+            raise OSError(f"cannot write {self.path}: {error.strerror}") from None
 
     def write(self, chunk: int, values: dict[str, Values]) -> None:
         """Store a chunk.
 
         **Raises:** `OSError` that names the path if that fails; earlier chunks remain finished.
         """
-        kinds = self.layout.kinds
-        with replacing(self.folder / f"{chunk}.npz") as scratch, scratch.open("wb") as stream:
-            arrays: dict[str, Any] = {name: np.asarray(cells, kinds[name]) for name, cells in values.items()}
-            np.savez(stream, **arrays)
+        try:
+            with Stream(self._unfinished, "r+b") as stream:
+                write_chunk(stream, self.layout, self._places, chunk, values, synced=True)
+        except OSError as error:
+            raise OSError(f"cannot write {self.path}: {error.strerror}") from None
 
     def interrupted(self) -> str:
         """Message after Ctrl-C: what is saved, and how to resume."""
-        numbers = chunks_in(self.folder, self.layout) | self.finished
-        cells = self.layout.cells if self._whole else sum(map(self.layout.size, numbers))
-        total = with_spaces(self.layout.cells)
-        return f"saved {with_spaces(cells)} of {total} cells to {self.path}; run the same call again to resume"
+        saved, total = with_spaces(saved_cells(self.path)), with_spaces(self.layout.cells)
+        return f"saved {saved} of {total} cells to {self.path}; run the same call again to resume"
 
     def _locked(self) -> IO[bytes] | None:
         """Create the folder, and keep others from computing the same file; the system releases the lock when this process
@@ -532,7 +538,7 @@ def with_spaces(count: int) -> str:
 
 
 def saved_cells(path: Path) -> int:
-    """Number of cells of a table that are on disk, in its file or in the files of its chunks.
+    """Number of cells of a table that are on disk, in its file or in that of an unfinished table.
 
     **Example:**
 
@@ -541,13 +547,12 @@ def saved_cells(path: Path) -> int:
     >>> saved_cells(Path("none.h5"))
     0
     """
-    folder = folder_of(path)
-    if path.exists():
-        return Stored(path).layout.cells
-    if not (folder / HEADER).exists():
+    unfinished = folder_of(path) / UNFINISHED
+    file = unfinished if unfinished.exists() else path
+    if not file.exists():
         return 0
-    layout = Stored(folder / HEADER).layout
-    return sum(map(layout.size, chunks_in(folder, layout)))
+    table = Stored(file)
+    return sum(map(table.layout.size, table.finished))
 
 
 def contents_of(path: Path) -> tuple[Layout, Mapping[str, Values]]:
@@ -556,39 +561,19 @@ def contents_of(path: Path) -> tuple[Layout, Mapping[str, Values]]:
 
     **Raises:** `OSError` that names the path if it cannot be read, holds no table, or has a damaged chunk.
     """
-    folder = folder_of(path)
-    if not path.exists() and (folder / HEADER).exists():
-        layout = Stored(folder / HEADER).layout
-        variables, damaged = layout.empty(layout.cells), 0
-        for chunk in chunks_in(folder, layout):
-            values = read_chunk(folder, layout, chunk)
-            damaged += values is None
-            layout.put(variables, chunk, values or {})
-        # The table may have been finished in the meantime.
-        if not path.exists():
-            if damaged:
-                reason = f"{damaged} of its {layout.chunks} chunks do not match their checksums"
-                raise OSError(f"cannot read {path}: it is damaged: {reason}")
-            return layout, variables
-    stored = Stored(path)
-    layout = stored.layout
-    if layout.bytes_of_cells(layout.cells) > MAX_BYTES_IN_MEMORY:
-        return layout, stored
-    return layout, {name: stored.whole(name) for name in layout.kinds}
-
-
-def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | None:
-    """The variables of a chunk; `None` if they do not match the checksums of the archive."""
+    unfinished = folder_of(path) / UNFINISHED
+    is_unfinished = not path.exists() and unfinished.exists()
     try:
-        # NumPy does not close a file that it cannot read.
-        with (folder / f"{chunk}.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            variables = {name: archive[name] for name in layout.kinds}
-    # What a damaged file makes NumPy raise can be of any kind.
-    except Exception:
-        return None
-    first, end = layout.ends(chunk)
-    right = {name: (kind, (end - first, *layout.inner_shape(name))) for name, kind in layout.kinds.items()}
-    return variables if {name: (values.dtype, values.shape) for name, values in variables.items()} == right else None
+        stored = Stored(unfinished if is_unfinished else path)
+        layout = stored.layout
+        if not is_unfinished and layout.bytes_of_cells(layout.cells) > MAX_BYTES_IN_MEMORY:
+            return layout, stored
+        return layout, {name: stored.whole(name) for name in layout.kinds}
+    except OSError:
+        # The table may have been finished in the meantime.
+        if is_unfinished and path.exists():
+            return contents_of(path)
+        raise
 
 
 def difference_between(old: Layout, new: Layout) -> str | None:
@@ -615,6 +600,6 @@ def difference_between(old: Layout, new: Layout) -> str | None:
             return f"the axis {name} differs"
     if list(old.coords) != list(new.coords):
         return f"its axes are {', '.join(old.coords)}"
-    if (old.kinds, old.inner, old.chunk) != (new.kinds, new.inner, new.chunk):
+    if (old.kinds, old.words, old.inner, old.chunk) != (new.kinds, new.words, new.inner, new.chunk):
         return f"it was not written by a sweep in {new.chunks} chunks"
     return None

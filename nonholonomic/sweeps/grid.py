@@ -88,19 +88,15 @@ class Layout(NamedTuple):
             variables[name] = np.full((cells, *self.inner_shape(name)), value, kind)
         return variables
 
-    def put(self, variables: dict[str, Values], chunk: int, values: dict[str, Values]) -> None:
-        """Write the values of a chunk into variables of all cells."""
-        for name, cells in values.items():
-            variables[name][slice(*self.ends(chunk))] = cells
-
     def shaped(self, name: str, values: Values) -> Tabulated:
         """A variable in the shape of the grid, with words instead of codes."""
         values = values.reshape((*self.shape, *self.inner_shape(name)))
         return np.array([*self.words[name], UNREACHED])[values] if name in self.words else values
 
-    def bytes_of_cells(self, cells: int) -> int:
-        """Memory for the numbers of some cells [bytes]."""
-        return cells * sum(kind.itemsize * math.prod(self.inner_shape(name)) for name, kind in self.kinds.items())
+    def bytes_of_cells(self, cells: int, *names: str) -> int:
+        """Memory for the numbers of some cells [bytes], of the named variables or of all."""
+        sizes = {name: self.kinds[name].itemsize * math.prod(self.inner_shape(name)) for name in names or self.kinds}
+        return cells * sum(sizes.values())
 
 
 def attributes_of(request: str, axes: list[str]) -> dict[str, str]:
@@ -112,25 +108,6 @@ def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> lis
     """The coordinates that are axes of the grid, without those of the variables' additional dimensions."""
     inner_dims = {dim for dims in inner.values() for dim in dims}
     return [name for name in coords if name not in inner_dims]
-
-
-def boxes(shape: tuple[int, ...], first: int, end: int) -> Iterator[tuple[slice, ...]]:
-    """Slices of an array that contain its elements with the flat indices from `first` to `end` - 1, in order."""
-    if not shape:
-        yield ()
-        return
-    row = math.prod(shape[1:])
-    while first < end:
-        start, offset = divmod(first, row)
-        rows = (end - first) // row
-        if offset == 0 and rows:
-            yield (slice(start, start + rows), *(slice(0, size) for size in shape[1:]))
-            first += rows * row
-        else:
-            stop = min(end, (start + 1) * row)
-            for box in boxes(shape[1:], offset, offset + stop - first):
-                yield (slice(start, start + 1), *box)
-            first = stop
 
 
 # A grid of named axes: its cells, and the parameters of each cell.

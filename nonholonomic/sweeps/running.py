@@ -269,7 +269,8 @@ def sweep(
                     return Table.load(store.path)
                 of_all_cells = layout.empty(layout.cells)
                 for number, values in chunks:
-                    layout.put(of_all_cells, number, values)
+                    for name, of_variable in of_all_cells.items():
+                        of_variable[slice(*layout.ends(number))] = values[name]
                 return Table.laid_out(layout, of_all_cells)
     except KeyboardInterrupt:
         none_saved = f"interrupted; without path=, none of {with_spaces(layout.cells)} cells is saved"

@@ -105,7 +105,11 @@ tippe.inversion_table(scene, theta=np.linspace(0.05, 0.3, 400), spin=[80.0, 100.
 
 def blocks_of(path):
     """The finished blocks of a table that is not."""
-    return {int(block.stem) for block in path.with_name(f"{path.name}.blocks").glob("*.npz")}
+    try:
+        cells = tippe.Table.load(path).status.reshape(200, 4)
+    except FileNotFoundError:
+        return set()
+    return set(np.flatnonzero((cells != "pending").all(axis=1)).tolist())
 
 
 @pytest.mark.slow

@@ -3,24 +3,25 @@
 import io
 import itertools
 import os
+from pathlib import Path
 
-import numpy as np
 import pytest
-from cheap_sweep import cheap_sweep, finished_blocks
+from cheap_sweep import VARIABLES, cheap_sweep, finished_blocks
 
 from nonholonomic.sweeps import Table
+from nonholonomic.sweeps._store import UNFINISHED, Stream
 
 
 class Killed(BaseException):
     """The end of the process at a chosen moment."""
 
 
-#: Disk operations: for the folder of the blocks and its note, for each block, and for the table's file.
-FOR_THE_FOLDER, FOR_A_BLOCK, FOR_THE_FILE = 4, 4, 3
+#: Disk operations: for the folder of the unfinished table and its file, for each block, and for the table's file.
+FOR_THE_FOLDER, FOR_A_BLOCK, FOR_THE_FILE = 4, 2 * len(VARIABLES) + 3, 2
 
 
 def fail_on_disk(monkeypatch, moment, torn, error):
-    """Have a sweep end at an operation on the disk: before a sync or a renaming, or in a block, of which a part is written."""
+    """Have a sweep end at an operation on the disk: before a sync or a renaming, or while a part of a block is written."""
     count = itertools.count()
 
     def failing(function):
@@ -31,17 +32,16 @@ def fail_on_disk(monkeypatch, moment, torn, error):
 
         return operation
 
-    def saved(stream, savez=np.savez, **arrays):
-        buffer = io.BytesIO()
-        savez(buffer, **arrays)
-        is_due = next(count) == moment
-        stream.write(buffer.getvalue()[: int(torn * len(buffer.getvalue())) if is_due else None])
-        if is_due:
+    def written(stream, data, write=Stream.write):
+        # HDF5 writes only to a file that has another name as yet.
+        if Path(stream.name).name == UNFINISHED and next(count) == moment:
+            io.FileIO.write(stream, data[: int(torn * len(data))])
             raise error
+        return write(stream, data)
 
     monkeypatch.setattr(os, "fsync", failing(os.fsync))
     monkeypatch.setattr(os, "replace", failing(os.replace))
-    monkeypatch.setattr(np, "savez", saved)
+    monkeypatch.setattr(Stream, "write", written)
 
 
 def half_finished(path):

@@ -13,7 +13,7 @@ import pytest
 from cheap_sweep import cheap_sweep, resumed
 
 from nonholonomic.command_line import INTERRUPTED, PATIENCE
-from nonholonomic.sweeps._store import ChunkStore
+from nonholonomic.sweeps._store import ChunkStore, Stored
 
 #: How long an answer to Ctrl-C may take [s]: twice as long where other programs keep all cores busy.
 PROMPT = 2.0 if os.getloadavg()[0] <= (os.cpu_count() or 1) else 4.0
@@ -136,9 +136,10 @@ def wait_for(condition, process: subprocess.Popen) -> None:
         time.sleep(0.01)
 
 
-def blocks(path: Path) -> list[Path]:
-    """The finished blocks: a file that is being written has `.part` in its name."""
-    return [file for file in path.with_name(f"{path.name}.blocks").glob("*.npz") if ".part" not in file.name]
+def blocks(path: Path) -> set[int]:
+    """The finished blocks of an unfinished table."""
+    file = path.with_name(f"{path.name}.blocks") / "table.h5"
+    return Stored(file).finished if file.exists() else set()
 
 
 @pytest.mark.parametrize("way", ["threads", pytest.param("processes", marks=pytest.mark.slow)])

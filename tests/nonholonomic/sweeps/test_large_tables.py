@@ -1,7 +1,6 @@
 """Tables larger than memory: blocks only are held, the numbers stay in the file, and illegal cells are found beforehand."""
 
 import itertools
-import math
 import os
 import time
 import tracemalloc
@@ -12,7 +11,7 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.sweeps import Table, Variable, axis, running, sweep
-from nonholonomic.sweeps.grid import Layout, boxes, cells_to_check, columns, size_of
+from nonholonomic.sweeps.grid import Layout, cells_to_check, columns, size_of
 
 X, Y = axis("x", "x", "s", np.linspace(0.0, 1.0, 1000)), axis("y", "y", "m", np.arange(500.0))
 VARIABLES = {
@@ -85,14 +84,6 @@ def test_a_number_that_changed_in_the_file_is_refused_when_it_is_asked_for(tmp_p
     assert table.status.shape == (500, 1000)
     with pytest.raises(OSError, match=r"damaged: 1 of its 123 chunks"):
         _ = Table.load(path).value
-
-
-@pytest.mark.parametrize("shape", [(), (5,), (3, 4), (2, 3, 4), (2, 1, 3, 2)])
-def test_boxes_hold_the_cells_of_a_block_in_order(shape):
-    cells = np.arange(math.prod(shape)).reshape(shape)
-    for first, end in itertools.combinations(range(cells.size + 1), 2):
-        parts = [cells[box].ravel() for box in boxes(shape, first, end)]
-        assert np.concatenate(parts).tolist() == list(range(first, end))
 
 
 @pytest.mark.parametrize(
