@@ -47,11 +47,11 @@ def as_numbers(value: Any) -> Any:
 USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
 
 
-def as_place(value: Any) -> tuple[Converted, ...]:
-    """Two or three numbers as a tuple of arrays; raises `ValueError` for anything else."""
+def as_place(value: Any, name: str = "place", counts: tuple = (2, 3), single: bool = False) -> tuple[Converted, ...]:
+    """Two or three numbers, or `single` ones, as a tuple of arrays; raises `ValueError` for anything else."""
     numbers = as_numbers(value)
-    if not (isinstance(numbers, tuple) and len(numbers) in (2, 3)):
-        raise ValueError(f"place = {shown(numbers)} must be a pair of numbers, or (x, y, z) [m]")
+    if not isinstance(numbers, tuple) or len(numbers) not in counts or (single and any(map(np.ndim, numbers))):
+        raise ValueError(f"{name} = {shown(numbers)} must be a pair of numbers{', or (x, y, z) [m]' * (3 in counts)}")
     return numbers
 
 

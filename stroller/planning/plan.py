@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.geometry import AbstractSurface, Plane
+from nonholonomic.geometry import Plane
 from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit, shown
 from nonholonomic.validation import require_file, require_flag, require_kind, require_package, require_whole
-from nonholonomic.views import DARK, Body, Mesh, Page, Stage, arena, bar, page
+from nonholonomic.views import DARK, Body, Mesh, Page, Stage, bar, page
 from nonholonomic.views.plot import new_figure
 from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
@@ -23,8 +23,9 @@ from ..model.dynamics import Dynamics, padded
 from ..model.scene import Launch, Scene
 from ..runs.model import simulate
 from ..runs.trajectory import Trajectory
+from ..runs.view import ground_of, normals
 from .planner import Planner, proposed
-from .problem import Box, Disc, Footprint, Goal, Limits, Points, Problem, checked_problem, corners_of, frame_of
+from .problem import Box, Corners, Disc, Footprint, Goal, Limits, Problem, checked_problem, corners_of, frame_of
 from .search import INTERVALS, guess_of, paths_of, prices
 from .transcription import FINE, LIMIT_RESERVE, Candidates, Drive, Task, Tracker, drive_along, interpolate, optimise
 
@@ -123,12 +124,12 @@ class Plan(eqx.Module):
         above = figure.add_subplot(grid[0], **({"projection": "3d", "elev": 60.0} if axes == 3 else {}))
         curves = figure.add_subplot(grid[1])
 
-        def draw(points: Points, colour: str, width: float, label: str | None = None, marker: str = "") -> None:
+        def draw(points: Corners, colour: str, width: float, label: str | None = None, marker: str = "") -> None:
             above.plot(*np.asarray(points).T[:axes], marker, color=colour, linewidth=width, label=label)
 
         for line in planned_stage(self).arena.lines if axes == 3 else ():
             draw(line, "0.7", 0.4)
-        for foot in (outline(surface, obstacle) for obstacle in problem.obstacles):
+        for foot in outlines_of_obstacles(problem):
             above.fill(*foot.T[:2], color="0.6") if axes == 2 else draw(foot[[*range(len(foot)), 0]], "0.4", 1.5)
         for line in self.candidates:
             draw(line, "0.75", 0.7)
@@ -237,32 +238,26 @@ def seen_along(
     drive: Drive,
     times: Float[Array, " times"],
     states: Float[Array, "times n"],
-) -> tuple[Points, Float[Array, " times"], Float[Array, " times"]]:
+) -> tuple[Corners, Float[Array, " times"], Float[Array, " times"]]:
     """The corners [m] of the footprint, the force [N] and the torque [N m] of a drive along a run."""
     corners = corners_of(dynamics, footprint, states.T[: 2 * dynamics.surface.axes])
     return corners, *drive(times, dynamics.geometry(states.T).motion)
 
 
 def clearance_of(
-    problem: Problem, times: Float[np.ndarray, " times"], corners: Float[np.ndarray, "times 4 2"]
+    problem: Problem, times: Float[np.ndarray, " times"], corners: Float[np.ndarray, "times 4 axes"]
 ) -> tuple[float, int]:
     """The least distance [m] between the footprint and an obstacle, negative for an overlap, and the obstacle's number;
     infinite without obstacles."""
     if not problem.obstacles:
         return np.inf, -1
-    coarse = np.stack([obstacle.distance(corners) for obstacle in problem.obstacles], axis=-1)
+    gaps = problem.gaps(corners)
     # Between two times, no corner moves further than this.
     moved = np.linalg.norm(np.diff(corners, axis=0), axis=-1).max(axis=-1)
-    lower = np.minimum(coarse[:-1], coarse[1:]) - moved[:, None]
-    path = CubicSpline(times, corners)
-    least, nearest = coarse.min(), int(np.argmin(coarse.min(axis=0)))
-    for number, obstacle in enumerate(problem.obstacles):
-        step = np.flatnonzero(lower[:, number] < least)
-        inner = times[step][:, None] + np.diff(times)[step][:, None] * np.arange(1, FINER) / FINER
-        fine = obstacle.distance(path(inner.ravel())).min(initial=np.inf)
-        if fine < least:
-            least, nearest = fine, number
-    return float(least), nearest
+    step = np.flatnonzero(np.minimum(gaps[:-1], gaps[1:]).min(axis=-1) - moved < gaps.min())
+    inner = times[step][:, None] + np.diff(times)[step][:, None] * np.arange(1, FINER) / FINER
+    least = np.concatenate([gaps, problem.gaps(CubicSpline(times, corners)(inner.ravel()))]).min(axis=0)
+    return float(least.min()), int(np.argmin(least))
 
 
 # Planning.
@@ -317,7 +312,7 @@ def plan(
     - `launch`: the `Launch` at which the drive begins.
     - `goal`: a `Goal`.
     - `t1`: duration of the drive [s], positive.
-    - `obstacles`: a list of `Box` and `Disc`, on a ground whose places are (x, y) [m].
+    - `obstacles`: a list of `Box` and `Disc`.
     - `limits`: `Limits` of steering angle, speed, force, torque and grip.
     - `footprint`: the `Footprint` that must not touch an obstacle; by default that of the drawn vehicle, 1.4 wheelbases
       long and 0.87 wide.
@@ -529,26 +524,28 @@ CLOSED = [0, 1, 2, 3, 0]
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 
-def outline(surface: AbstractSurface, obstacle: Box | Disc) -> Float[np.ndarray, "corners 3"]:
-    """The outline of an obstacle on the ground [m], in the fixed frame."""
-    angle = 2.0 * np.pi * np.arange(SIDES) / SIDES
+def outlines_of_obstacles(problem: Problem) -> Iterator[Float[np.ndarray, "corners 3"]]:
+    """The outlines of the obstacles on the ground [m], in the fixed frame."""
+    surface, angle = problem.scene.surface, 2.0 * np.pi * np.arange(SIDES) / SIDES
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    is_box = isinstance(obstacle, Box)
-    corners = obstacle.corners if is_box else np.array(obstacle.centre) + float(obstacle.radius) * unit
-    return fixed(surface, surface.chart((corners[:, 0], corners[:, 1]))[0])
+    for part, frame in problem.standing:
+        corners = part.corners if isinstance(part, Box) else np.array(part.centre) + float(part.radius) * unit
+        in_space = frame[0] + corners @ frame[1:3]
+        ground = surface.chart(tuple(corners.T))[0] if problem.tangent is None else surface.nearest(tuple(in_space.T))
+        yield fixed(surface, ground)
 
 
 def planned_stage(plan: Plan) -> Stage:
     """The run of a plan on its stage, with obstacles, candidates, footprint and goal."""
     (stage,) = plan.run.stages()
     problem, (show, *_) = plan.problem, stage.shows
-    surface, length, count = problem.scene.surface, float(problem.scene.body.wheelbase), len(show.times)
-    feet = [outline(surface, part) for part in problem.obstacles]
-    points = np.concatenate([np.asarray(plan.run.position), *feet])
-    ground = arena(surface, points, stage.arena.normal, 3.0 * length, length)
-    still = [("candidates", [ribbon(line, RAISED * length, THIN * length) for line in plan.candidates])]
-    if feet:
-        still.append(("obstacles", [prism(foot, HEIGHT * length) for foot in feet]))
+    length, count = float(problem.scene.body.wheelbase), len(show.times)
+    feet = list(outlines_of_obstacles(problem))
+    ground, lines = ground_of([plan.run], stage.arena.normal, *feet), list(plan.candidates)
+    ribbons = [ribbon(line, normals(np, problem.scene, line), RAISED * length, THIN * length) for line in lines]
+    still = [("candidates", ribbons)]
+    blocks = [prism(foot, frame[3], HEIGHT * length) for foot, (_, frame) in zip(feet, problem.standing, strict=True)]
+    still += [("obstacles", blocks)] if blocks else []
     ends = goal_corners(problem, 2.0 * RAISED * length)
     pairs = (ends[:2], ends[2:]) if problem.goal.heading is None else (ends, np.roll(ends, -1, axis=0))
     arms = [bar(tuple(a), tuple(b), 2.0 * THIN * length, GREEN) for a, b in zip(*pairs, strict=True)]
@@ -556,9 +553,8 @@ def planned_stage(plan: Plan) -> Stage:
     place, turn = np.zeros((count, 3)), np.tile(UNTURNED, (count, 1))
     bodies = tuple(Body(name, place, turn, tuple(meshes)) for name, meshes in still)
     vehicle = show.bodies[0]
-    own = problem.footprint.corners(np.zeros(2), np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     # The frame's origin is the middle of the rear axle, above the ground.
-    low = np.concatenate([np.asarray(own), np.full((4, 1), -0.17 * length)], axis=1)
+    low = np.asarray(problem.footprint.corners(np.array([0.0, 0.0, -0.17 * length]), *np.eye(3)[:2]))
     edges = zip(map(tuple, low), map(tuple, np.roll(low, -1, axis=0)), strict=True)
     frame = tuple(bar(a, b, 1.5 * THIN * length, DARK) for a, b in edges)
     footprint = Body("footprint", vehicle.position, vehicle.orientation, frame)
@@ -585,19 +581,18 @@ def outlines(
     return fixed(surface, ground) + raised * dynamics.side * fixed(surface, surface.normal(ground))
 
 
-def prism(foot: Float[np.ndarray, "corners 3"], height: float) -> Mesh:
+def prism(foot: Float[np.ndarray, "corners 3"], up: Float[np.ndarray, " 3"], height: float) -> Mesh:
     """An upright prism on its corners on the ground, and a lid of triangles about its middle."""
-    top = np.array(foot)
-    top[:, 2] = foot[:, 2].max() + height
+    level = foot @ up
+    top = foot + (level.max() + height - level)[:, None] * up
     columns = np.stack([np.broadcast_to(top.mean(axis=0), top.shape), top, foot], axis=1)
     closed = np.concatenate([columns, columns[:1]])
     return Mesh(closed.reshape(-1, 3), of_grid(len(closed), 3), STONE)
 
 
-def ribbon(line: Float[np.ndarray, "points 3"], raised: float, half: float) -> Mesh:
+def ribbon(line: Corners, normal: Corners, raised: float, half: float) -> Mesh:
     """A thin band along a line, above the ground."""
-    along = np.gradient(line, axis=0)
-    across = np.stack([-along[:, 1], along[:, 0], np.zeros(len(line))], axis=-1)
+    across = np.cross(normal, np.gradient(line, axis=0))
     across *= half / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
-    above = line + np.array([0.0, 0.0, raised])
+    above = line + raised * normal
     return Mesh(np.stack([above - across, above + across], axis=1).reshape(-1, 3), of_grid(len(line), 2), FAINT)

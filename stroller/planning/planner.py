@@ -20,7 +20,7 @@ from nonholonomic.validation import require, require_flag, require_kind, require
 
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import Scene
-from .problem import FAR, SQUARE, Pose, checked_problem, frame_of
+from .problem import FAR, FROM_ABOVE, SQUARE, Pose, checked_problem, frame_of
 from .transcription import ORDER, Numbers, Task, drive_from, motion_at, point_residuals, windows
 
 # A network that proposes drives, step by step: it sees the goal and the obstacles from where the stroller is.
@@ -119,7 +119,10 @@ class Planner(eqx.Module):
         # Of the obstacles: their corners, a disc as a square. Those that pad the list are far away.
         squares = obstacles.centres[:, None] + SQUARE * obstacles.radii[:, None, None]
         corners = jnp.concatenate([obstacles.boxes, squares])
-        origin, *directions = (jnp.stack(part[:2]) for part in (place, heading, left))
+        if tuple(dynamics.surface.coordinates) != FROM_ABOVE:
+            frames = jnp.concatenate([obstacles.box_frames, obstacles.disc_frames])
+            corners = frames[:, :1] + corners @ frames[:, 1:3]
+        origin, *directions = (jnp.stack(part[: corners.shape[-1]]) for part in (place, heading, left))
         seen = jnp.arcsinh((corners - origin) @ jnp.stack(directions, axis=1) / task.length)
         each = jax.vmap(self.of_obstacle)(seen.reshape(-1, CORNERS).astype(jnp.float32))
         each = jnp.where(jnp.abs(corners[:, :1, 0]) < 0.1 * FAR, each, 0.0)

@@ -28,11 +28,18 @@ from nonholonomic.validation import (
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import Angled, Launch, Scene, as_numbers, as_place
 
-#: Numbers, and points (..., points, 2), in NumPy or in JAX.
+#: Numbers, points (..., points, 2), and points of the ground, seen from above or in space, in NumPy or in JAX.
 Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
 Points: TypeAlias = Float[Array | np.ndarray, "... points 2"]
+Corners: TypeAlias = Float[Array | np.ndarray, "... points axes"]
 
-# Obstacles, and the footprint of the stroller, in the horizontal plane.
+#: The frame of an obstacle, in the ground's axes: its origin, the directions of its axes, and upwards.
+Frame: TypeAlias = Float[Array | np.ndarray, "... 4 3"]
+
+# Obstacles, and the footprint of the stroller: in the coordinates x and y, or in space.
+#
+# Where the ground's coordinates are x and y, everything is seen from above. On any other ground, each obstacle sees the
+# corners of the footprint along the normal of its tangent plane, in coordinates of its own.
 
 #: The numbers of boxes and of discs are padded to a multiple of this, so that other problems use the same programs.
 PADDING = 8
@@ -43,6 +50,9 @@ SQUARE = np.array([[1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
 #: Distance [m] of the obstacles that pad a list.
 FAR = 1e9
 
+#: The coordinates of a ground on which all is seen from above, and the frame of its obstacles.
+FROM_ABOVE, ABOVE = (("x", "m"), ("y", "m")), np.eye(4, 3, -1)
+
 #: Length, width and rear overhang of the drawn vehicle, in units of the wheelbase.
 DRAWN = (1.4, 0.87, 0.2)
 
@@ -50,27 +60,23 @@ DRAWN = (1.4, 0.87, 0.2)
 SMALLEST_SQUARE = 1e-18
 
 
-class Obstacle(Bounded):
-    """An obstacle, whose tuples are pairs of single numbers."""
-
-    def __check_init__(self):
-        for name, example in {"centre": "(1.0, 0.5)", "size": "(0.5, 0.25)"}.items():
-            if hasattr(self, name):
-                value = getattr(self, name)
-                if not (
-                    isinstance(value, tuple) and len(value) == 2 and all(np.shape(number) == () for number in value)
-                ):
-                    raise ValueError(f"{name} = {shown(value)} must be a pair of numbers, such as {example}")
+#: Square of a length [m^2] that is lost in that of any other edge.
+NO_EDGE = 1e-30
 
 
-class Box(Obstacle):
-    """A rectangular obstacle in the coordinates x and y.
+as_centre = functools.partial(as_place, name="centre", single=True)
+as_size = functools.partial(as_place, name="size", counts=(2,), single=True)
+
+
+class Box(Bounded):
+    """A rectangular obstacle, seen from above where the ground's coordinates are x and y. On any other ground, it stands on the
+    tangent plane at its centre, and reaches as far above and below this plane as its corners are from the centre.
 
     **Arguments:**
 
-    - `centre`: its middle (x, y) [m].
+    - `centre`: its middle, in the ground's coordinates, as the place of a `Launch`.
     - `size`: its lengths [m] along its own two axes, positive.
-    - `angle`: angle [rad] from x to its first axis.
+    - `angle`: angle [rad] of its first axis, as the heading of a `Launch`.
 
     **Raises:** `ValueError` for numbers out of range.
 
@@ -79,15 +85,15 @@ class Box(Obstacle):
     ```
     >>> import stroller
     >>> stroller.Box(centre=(1.0, 0.3), size=(0.5, 0.25))
-    Box(centre=(1, 0.3) m, size=(0.5, 0.25) m, angle=0 rad)
+    Box(centre=(1, 0.3) m or rad, size=(0.5, 0.25) m, angle=0 rad)
 
     ```
     """
 
-    units: ClassVar[dict[str, str]] = {"centre": "m", "size": "m", "angle": "rad"}
+    units: ClassVar[dict[str, str]] = {"centre": "m or rad", "size": "m", "angle": "rad"}
 
-    centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
-    size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers, metadata=Bound.POSITIVE)
+    centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_centre)
+    size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_size, metadata=Bound.POSITIVE)
     angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
 
     @property
@@ -105,12 +111,13 @@ class Box(Obstacle):
         return np.where(gap > 0.0, apart, gap)
 
 
-class Disc(Obstacle):
-    """A round obstacle in the coordinates x and y.
+class Disc(Bounded):
+    """A round obstacle, seen from above where the ground's coordinates are x and y. On any other ground, it stands on the
+    tangent plane at its centre, and reaches a radius above and below this plane.
 
     **Arguments:**
 
-    - `centre`: its middle (x, y) [m].
+    - `centre`: its middle, in the ground's coordinates, as the place of a `Launch`.
     - `radius`: its radius [m], positive.
 
     **Raises:** `ValueError` for numbers out of range.
@@ -120,14 +127,17 @@ class Disc(Obstacle):
     ```
     >>> import stroller
     >>> stroller.Disc(centre=(1.0, 0.3), radius=0.2)
-    Disc(centre=(1, 0.3) m, radius=0.2 m)
+    Disc(centre=(1, 0.3) m or rad, radius=0.2 m)
 
     ```
     """
 
-    units: ClassVar[dict[str, str]] = {"centre": "m", "radius": "m"}
+    units: ClassVar[dict[str, str]] = {"centre": "m or rad", "radius": "m"}
 
-    centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_numbers)
+    #: The direction of its frame.
+    angle: ClassVar[float] = 0.0
+
+    centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_centre)
     radius: Float[Array, ""] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
 
     def distance(self, polygon: Points) -> Numbers:
@@ -165,9 +175,9 @@ class Footprint(Bounded):
         yield from super().bounds()
         yield Bound(self.rear, "rear", at_most=self.length, why="the length")
 
-    def corners(self, place: Points, heading: Points, left: Points) -> Points:
+    def corners(self, place: Corners, heading: Corners, left: Corners) -> Corners:
         """The corners [m], counterclockwise. **Arguments:** `place`: the rear axle [m]; `heading`, `left`: unit vectors
-        of the stroller, seen from above."""
+        of the stroller, seen from above or in space."""
         front, half = self.length - self.rear, self.width / 2.0
         along = np.array([1.0, 1.0, 0.0, 0.0])[:, None] * front - np.array([0.0, 0.0, 1.0, 1.0])[:, None] * self.rear
         across = np.array([-1.0, 1.0, 1.0, -1.0])[:, None] * half
@@ -175,35 +185,61 @@ class Footprint(Bounded):
 
 
 class Obstacles(eqx.Module):
-    """The obstacles as arrays, padded: corners of the boxes (boxes, 4, 2), centres (discs, 2) and radii of the discs."""
+    """The obstacles as arrays, padded: corners of the boxes (boxes, 4, 2), centres (discs, 2) and radii of the discs, and the
+    frames of both."""
 
     boxes: Float[Array | np.ndarray, "boxes 4 2"]
     centres: Float[Array | np.ndarray, "discs 2"]
     radii: Float[Array | np.ndarray, " discs"]
+    box_frames: Frame
+    disc_frames: Frame
 
     @classmethod
-    def of(cls, obstacles: Sequence[Box | Disc]) -> "Obstacles":
-        """Boxes and discs as arrays, padded."""
-        boxes = np.array([box.corners for box in obstacles if isinstance(box, Box)]).reshape(-1, 4, 2)
-        discs = [[*disc.centre, disc.radius] for disc in obstacles if isinstance(disc, Disc)]
-        circles = np.array(discs, dtype=float).reshape(-1, 3)
-        counts = (-(-len(parts) // PADDING) * PADDING for parts in (boxes, circles))
-        return cls(boxes, circles[:, :2], circles[:, 2]).padded(*counts)
+    def of(cls, obstacles: Sequence[tuple[Box | Disc, Frame]]) -> "Obstacles":
+        """Boxes and discs in their frames as arrays, padded."""
+        boxes = [(part, frame) for part, frame in obstacles if isinstance(part, Box)]
+        discs = [(part, frame) for part, frame in obstacles if isinstance(part, Disc)]
+        circles = np.array([[*disc.centre, disc.radius] for disc, _ in discs], dtype=float).reshape(-1, 3)
+        frames = (np.array([frame for _, frame in pairs]).reshape(-1, 4, 3) for pairs in (boxes, discs))
+        arrays = np.array([box.corners for box, _ in boxes]).reshape(-1, 4, 2), circles[:, :2], circles[:, 2], *frames
+        return cls(*arrays).padded(*(-(-len(pairs) // PADDING) * PADDING for pairs in (boxes, discs)))
 
     def padded(self, boxes: int, discs: int) -> "Obstacles":
         """The obstacles with others far away, so that there are so many boxes and discs; in NumPy, because JAX would
         compile a program for every number of obstacles."""
-        others = Box((FAR, FAR), (1.0, 1.0)).corners, np.full(2, FAR), np.ones(())
-        counts, parts = (boxes, discs, discs), (self.boxes, self.centres, self.radii)
+        others = Box((FAR, FAR), (1.0, 1.0)).corners, np.full(2, FAR), np.ones(()), ABOVE, ABOVE
+        counts, parts = (boxes, discs, discs, boxes, discs), jax.tree.leaves(self)
         more = [np.broadcast_to(far, (n - len(a), *far.shape)) for a, far, n in zip(parts, others, counts, strict=True)]
         return Obstacles(*(jnp.asarray(np.concatenate(pair)) for pair in zip(parts, more, strict=True)))
 
-    def gaps(self, corners: Points) -> Numbers:
+    def gaps(self, corners: Corners) -> Numbers:
         """A lower bound [m] of the distance of footprints from every obstacle, with a slope everywhere."""
         xp = np if isinstance(corners, np.ndarray) else jnp
-        boxes = separation(corners[..., None, :, :], self.boxes)
-        discs = disc_distance(corners[..., None, :, :], self.centres, self.radii)
-        return xp.concatenate([boxes, discs], axis=-1)
+        boxes, above_boxes = seen_from(self.box_frames, corners)
+        discs, above_discs = seen_from(self.disc_frames, corners)
+        gaps = separation(boxes, self.boxes), disc_distance(discs, self.centres, self.radii)
+        above = above_boxes - (self.boxes[:, 0] ** 2).sum(-1) ** 0.5, above_discs - self.radii
+        return xp.concatenate([xp.maximum(*pair) for pair in zip(gaps, above, strict=True)], axis=-1)
+
+
+def seen_from(frames: Frame, corners: Corners) -> tuple[Points, Numbers | float]:
+    """The corners of footprints as each obstacle sees them, (..., obstacles, 4, 2), counterclockwise, and how far [m] the whole
+    footprint is above or below the obstacle's plane: negative if it is on both sides, and if all is seen from above."""
+    if corners.shape[-1] == 2:
+        return corners[..., None, :, :], -np.inf
+    xp: Any = np if isinstance(corners, np.ndarray) else jnp
+    away = corners[..., None, :, :] - frames[:, :1]
+    own = (away[..., None, :] * frames[:, None, 1:]).sum(-1)
+    flat, height = own[..., :2], own[..., 2]
+    along, across = flat[..., 1, :] - flat[..., 0, :], flat[..., 2, :] - flat[..., 1, :]
+    is_mirrored = along[..., 0] * across[..., 1] < along[..., 1] * across[..., 0]
+    flat = xp.where(is_mirrored[..., None, None], flat[..., ::-1, :], flat)
+    return flat, xp.maximum(_least(height, -1), _least(-height, -1))
+
+
+def moved(part: Box | Disc, centre: ArrayLike | tuple[float, float], angle: ArrayLike) -> Box | Disc:
+    """An obstacle at another place."""
+    return Box(centre, part.size, angle) if isinstance(part, Box) else Disc(centre, part.radius)
 
 
 def require_obstacles(obstacles: Iterable[Box | Disc]) -> tuple[Box | Disc, ...]:
@@ -240,7 +276,7 @@ def _least(values: Numbers, axis: int) -> Numbers:
 def _face_gaps(polygon: Points, points: Points) -> Numbers:
     """How far points (..., points, 2) are outside each face of a polygon: (..., faces, points)."""
     edge = polygon[..., NEXT, :] - polygon
-    length = (edge * edge).sum(-1) ** 0.5
+    length = ((edge * edge).sum(-1) + NO_EDGE) ** 0.5
     normal_x, normal_y = edge[..., 1] / length, -edge[..., 0] / length
     offset = normal_x * polygon[..., 0] + normal_y * polygon[..., 1]
     x, y = points[..., None, :, 0], points[..., None, :, 1]
@@ -261,7 +297,7 @@ def _edge_distance(polygon: Points, points: Points) -> Numbers:
     """Distance [m] of points (..., points, 2) from the boundary of a polygon."""
     edge = (polygon[..., NEXT, :] - polygon)[..., :, None, :]
     along = points[..., None, :, :] - polygon[..., :, None, :]
-    part = ((along * edge).sum(-1) / (edge * edge).sum(-1)).clip(0.0, 1.0)
+    part = ((along * edge).sum(-1) / ((edge * edge).sum(-1) + NO_EDGE)).clip(0.0, 1.0)
     away = along - part[..., None] * edge
     return (_least((away * away).sum(-1), -2) + SMALLEST_SQUARE) ** 0.5
 
@@ -354,19 +390,16 @@ class Limits(Angled):
     torque: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None)
     grip: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None)
 
-    def __check_init__(self):
-        for name in self.units:
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, tuple) and len(value) == 2):
+    def bounds(self) -> Iterator[Bound]:
+        pairs = {name: getattr(self, name) for name in self.units if getattr(self, name) is not None}
+        for name, value in pairs.items():
+            if not (isinstance(value, tuple) and len(value) == 2):
                 bound = f"{largest(as_number(value)) or 1.0:g}"
                 words = f"one positive number, such as {bound} for (-{bound}, {bound}), or a pair (lowest, highest)"
                 raise ValueError(f"{name} = {shown(value)} must be {words}")
-
-    def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
-        for name in self.units:
-            if (value := getattr(self, name)) is not None:
-                yield Bound(value[1], f"{name}[1]", above=value[0], why="the lower bound")
+        for name, (low, high) in pairs.items():
+            yield Bound(high, f"{name}[1]", above=low, why="the lower bound")
 
     def ranges(self) -> dict[str, tuple[float, float]]:
         """The limits by name; those that are `None` are left out."""
@@ -408,9 +441,10 @@ def frame_of(dynamics: Dynamics, pose: Float[Array, "components *n"]) -> tuple[V
     return place, heading, scale(dynamics.side, cross(dynamics.surface.normal(place), heading))
 
 
-def corners_of(dynamics: Dynamics, footprint: Footprint, pose: Float[Array, "components *n"]) -> Points:
-    """The corners [m] of the footprint at a pose, or at many, as seen from above."""
-    return footprint.corners(*(jnp.stack(part[:2], axis=-1) for part in frame_of(dynamics, pose)))
+def corners_of(dynamics: Dynamics, footprint: Footprint, pose: Float[Array, "components *n"]) -> Corners:
+    """The corners [m] of the footprint at a pose, or at many, as seen from above or in space."""
+    axes = 2 if tuple(dynamics.surface.coordinates) == FROM_ABOVE else 3
+    return footprint.corners(*(jnp.stack(part[:axes], axis=-1) for part in frame_of(dynamics, pose)))
 
 
 @eqx.filter_jit
@@ -422,7 +456,7 @@ def pose_of(scene: Scene, place: tuple[ArrayLike, ...], heading: Float[Array, ""
 
 @eqx.filter_jit
 def poses_at(
-    surface: AbstractSurface, tangent: Float[Array | np.ndarray, "3 3"] | None, points: Float[Array | np.ndarray, "n 3"]
+    surface: AbstractSurface, tangent: Frame | None, points: Float[Array | np.ndarray, "n 3"]
 ) -> Float[Array, "n components"]:
     """The poses of points and headings on the map of a problem. **Arguments:** `tangent`: that of the `Problem`."""
 
@@ -430,7 +464,7 @@ def poses_at(
         if tangent is None:
             place = surface.charted((point[0], point[1]))[0]
         else:
-            origin, east, north = tangent
+            origin, east, north, _ = tangent
             place = surface.nearest(padded(origin + point[0] * east + point[1] * north))
         return jnp.stack(place[: surface.axes])
 
@@ -474,27 +508,49 @@ class Problem(eqx.Module):
         """The straight distance [m] from the start to the goal."""
         return float(np.linalg.norm(np.asarray(self.goal_pose - self.start_pose)[: self.scene.surface.axes]))
 
+    def frame(self, place: tuple[ArrayLike, ...], angle: ArrayLike) -> Float[np.ndarray, "4 3"]:
+        """The frame at a place, whose first axis has the direction of a heading [rad]."""
+        place, heading, left = frame_of(
+            self.scene.dynamics, pose_of(self.scene, place, jnp.asarray(angle, dtype=float))
+        )
+        return np.array([place, heading, left, cross(heading, left)], dtype=float)
+
     @functools.cached_property
-    def tangent(self) -> Float[np.ndarray, "3 3"] | None:
-        """The origin and the unit vectors of the plane whose points stand for the nearest ones of the ground; `None` if the
-        ground names its places x and y."""
+    def tangent(self) -> Float[np.ndarray, "4 3"] | None:
+        """The frame of the plane whose points stand for the nearest ones of the ground; `None` if the ground names its places x
+        and y."""
         surface, axes = self.scene.surface, self.scene.surface.axes
-        if tuple(surface.coordinates) == (("x", "m"), ("y", "m")):
+        if tuple(surface.coordinates) == FROM_ABOVE:
             return None
         middle = (self.start_pose[:axes] + self.goal_pose[:axes]) / 2.0
-        position, east, _ = surface.chart(surface.place_at(surface.nearest(padded(middle))))
-        north = scale(self.scene.dynamics.side, cross(surface.normal(position), east))
-        vectors = [[0.0 if part is None else part for part in vector] for vector in (position, east, north)]
-        return np.array(vectors, dtype=float)
+        return self.frame(surface.place_at(surface.nearest(padded(middle))), 0.0)
 
-    def point(self, pose: Pose) -> Float[np.ndarray, " 3"]:
+    def point(self, pose: Float[Array | np.ndarray, " components"]) -> Float[np.ndarray, " 3"]:
         """The point and the heading (x, y, angle) on the map of a pose."""
         axes = self.scene.surface.axes
         place, heading = np.asarray(pose[:axes]), np.asarray(pose[axes:])
         if self.tangent is not None:
-            origin, plane = self.tangent[0], self.tangent[1:]
-            place, heading = plane @ (place - origin), plane @ heading
+            plane = self.tangent[1:3]
+            place, heading = plane @ (place - self.tangent[0]), plane @ heading
         return np.array([place[0], place[1], np.arctan2(heading[1], heading[0])])
+
+    @functools.cached_property
+    def standing(self) -> list[tuple[Box | Disc, Float[np.ndarray, "4 3"]]]:
+        """Each obstacle in the coordinates of its frame, and this frame."""
+        if self.tangent is not None:
+            return [(moved(part, (0.0, 0.0), 0.0), self.frame(part.centre, part.angle)) for part in self.obstacles]
+        places = [np.asarray(pose_of(self.scene, part.centre, jnp.zeros(())))[:2] for part in self.obstacles]
+        return [(moved(part, place, part.angle), ABOVE) for part, place in zip(self.obstacles, places, strict=True)]
+
+    def gaps(self, corners: Float[np.ndarray, "footprints 4 axes"]) -> Float[np.ndarray, "footprints obstacles"]:
+        """The exact distance [m] of footprints from every obstacle, in its tangent plane or along its normal; negative for an
+        overlap."""
+        gaps = np.empty((len(corners), len(self.standing)))
+        for number, (part, frame) in enumerate(self.standing):
+            polygon, above = seen_from(frame[None], corners)
+            reach = float(part.radius) if isinstance(part, Disc) else np.linalg.norm(part.corners[0])
+            gaps[:, number] = np.maximum(part.distance(np.asarray(polygon[:, 0])), np.ravel(above) - reach)
+        return gaps
 
     @functools.cached_property
     def gaps_at_ends(self) -> dict[str, Float[np.ndarray, " obstacles"]]:
@@ -504,14 +560,14 @@ class Problem(eqx.Module):
         headings = whole_turn if goal.heading is None else [goal.heading]
         poses = [self.start_pose, *(pose_of(self.scene, goal.place, heading) for heading in headings)]
         corners = np.asarray(corners_of(self.scene.dynamics, self.footprint, jnp.stack(poses, axis=1)))
-        launch, *goals = np.stack([obstacle.distance(corners) for obstacle in self.obstacles], axis=1)
-        return {"launch": launch, "goal": max(goals, key=np.min)}
+        launch, *goals = self.gaps(corners)
+        return {"launch": launch, "goal": max(goals, key=lambda goal: goal.min(initial=np.inf))}
 
     @property
     def clearance(self) -> float:
         """The clearance [m] to keep at first, which the start and the goal leave."""
-        gaps = self.gaps_at_ends.values() if self.obstacles else ()
-        return min([RESERVE * float(self.footprint.length), *(0.5 * float(np.min(gap)) for gap in gaps)])
+        gaps = (0.5 * float(gap.min(initial=np.inf)) for gap in self.gaps_at_ends.values())
+        return min(RESERVE * float(self.footprint.length), *gaps)
 
 
 def checked_problem(
@@ -542,10 +598,12 @@ def checked_problem(
     require_kind(footprint, "footprint", Footprint)
     duration = float(np.asarray(t1))
     problem = Problem(scene, launch, goal, duration, require_obstacles(obstacles), limits, footprint, in_haste)
-    try:
-        require_all(scene.surface.place_bounds(goal.place, scene.body.wheelbase))
-    except ValueError as error:
-        raise ValueError(f"goal: {error}") from None
+    centres = {f"obstacles[{number}]": part.centre for number, part in enumerate(problem.obstacles)}
+    for name, place in {"goal": goal.place, **centres}.items():
+        try:
+            require_all(scene.surface.place_bounds(place, scene.body.wheelbase))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
     if not np.all(np.isfinite(problem.goal_pose)):
         raise ValueError(f"goal: place = {goal.place} must be on the ground, where it has no finite position")
     if problem.distance > FARTHEST * float(scene.body.wheelbase):
@@ -554,33 +612,15 @@ def checked_problem(
             f"goal: place = {shown(goal.place)} is too far: {away}; plan a long way in stages, goal by goal"
         )
     why = "limits; no plan can keep a limit that is broken at its ends"
-    for owner, name, value in (
-        ("launch", "steering", launch.steering),
-        ("launch", "speed", launch.speed),
-        ("goal", "speed", goal.speed),
-    ):
+    for owner, part, name in (("launch", launch, "steering"), ("launch", launch, "speed"), ("goal", goal, "speed")):
         low, high = limits.ranges().get(name, (None, None))
-        require(value, f"{owner}.{name}", at_least=low, at_most=high, why=why)
-    _require_free(problem)
-    return problem
-
-
-def _require_free(problem: Problem) -> None:
-    """Raise `ValueError` for obstacles on a ground without x and y, and for a start or a goal that touches an obstacle."""
-    surface = problem.scene.surface
-    if not problem.obstacles:
-        return
-    if problem.tangent is not None:
-        names = ", ".join(f"{name} [{unit}]" for name, unit in surface.coordinates)
-        raise ValueError(
-            f"obstacles: a {type(surface).__name__} names its places ({names}); obstacles need a ground with places "
-            "(x [m], y [m]), such as a Plane or a Graph"
-        )
+        require(getattr(part, name), f"{owner}.{name}", at_least=low, at_most=high, why=why)
     for name, gaps in problem.gaps_at_ends.items():
-        if gaps.min() <= 0.0:
+        if gaps.min(initial=np.inf) <= 0.0:
             nearest = int(np.argmin(gaps))
             place = ", ".join(f"{float(number):g}" for number in getattr(problem, name).place)
             raise ValueError(
                 f"{name}: at place = ({place}) the footprint overlaps obstacles[{nearest}] by {abs(gaps[nearest]):.3g} m: "
                 f"move the {name} or the obstacle, or pass a smaller footprint"
             )
+    return problem

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from .problem import FAR, Numbers, Obstacles, Problem, poses_at
+from .problem import ABOVE, FAR, Numbers, Obstacles, Problem, moved, poses_at
 from .transcription import LIMIT_RESERVE, ORDER
 
 # The region of a search, and what the stroller may do there.
@@ -103,8 +103,14 @@ class Search:
         """**Arguments:** `share`: share of the curvatures, which the limits of the steering angle allow, that is used."""
         self.costs, self.has_heading = costs, problem.goal.heading is not None
         start, self.goal = problem.point(problem.start_pose), problem.point(problem.goal_pose)
+        standing = problem.standing
+        if problem.tangent is not None:
+            # The map shows one side of a closed ground.
+            standing = [pair for pair in standing if pair[1][3] @ problem.tangent[3] > 0.0]
+            points = [problem.point(frame[:2].ravel()) for _, frame in standing]
+            standing = [(moved(part, at[:2], at[2]), ABOVE) for (part, _), at in zip(standing, points, strict=True)]
         # NumPy would otherwise dispatch every operation with these to JAX.
-        obstacles, footprint = jax.tree.map(np.asarray, (Obstacles.of(problem.obstacles), problem.footprint))
+        obstacles, footprint = jax.tree.map(np.asarray, (Obstacles.of(standing), problem.footprint))
         self.obstacles, self.footprint = obstacles, footprint
         angles = problem.limits.arrays(LIMIT_RESERVE)
         low, high = (float(np.tan(angle[0])) / float(problem.scene.body.wheelbase) for angle in angles)
@@ -408,18 +414,16 @@ def guess_of(problem: Problem, path: Path) -> tuple[Float[np.ndarray, "rows unkn
         slowest = [way / accelerations[0], way / accelerations[1], body.steering_inertia / most.get("torque", np.inf)]
         t1 = max(way / most.get("speed", np.inf), 2.0 * float(np.sqrt(max(slowest))))
     points, speed, curvature = timed(path, INTERVALS + 1, t1, wheelbase)
-    steering = smoothed(np.arctan(wheelbase * curvature), SMOOTHING[0])
-    front_speed = smoothed(speed, SMOOTHING[1]) / np.cos(steering)
+    steering, speed = (
+        # A running mean.
+        np.convolve(np.pad(values, width, mode="edge"), np.full(2 * width + 1, 1.0 / (2 * width + 1)), mode="valid")
+        for values, width in zip((np.arctan(wheelbase * curvature), speed), SMOOTHING, strict=True)
+    )
+    front_speed = speed / np.cos(steering)
     poses = np.asarray(poses_at(scene.surface, problem.tangent, points))
     poses = np.concatenate([poses, poses[-1:], poses[-1:]])
     splines = np.pad(np.stack([steering, front_speed], axis=1), ((1, ORDER - 3), (0, 0)), mode="edge")
     return np.concatenate([poses, splines], axis=1), t1
-
-
-def smoothed(values: Float[np.ndarray, " n"], width: int) -> Float[np.ndarray, " n"]:
-    """A running mean over 2 `width` + 1 values."""
-    padded = np.pad(values, width, mode="edge")
-    return np.convolve(padded, np.full(2 * width + 1, 1.0 / (2 * width + 1)), mode="valid")
 
 
 def timed(

@@ -22,7 +22,7 @@ from nonholonomic.geometry import AbstractSurface, Vector, add, cross, differenc
 
 from ..model.dynamics import Dynamics, padded
 from ..model.input import Motion
-from .problem import Footprint, Obstacles, Pose, Problem, corners_of
+from .problem import Footprint, Obstacles, Pose, Problem, corners_of, frame_of
 
 #: Numbers in JAX; and coefficients of the splines of the steering angle and of the front wheel's speed, all or those of an
 #: interval.
@@ -56,26 +56,18 @@ class Actuation(NamedTuple):
     grip: Float[Array, " axles"]
 
 
-def state_of(
-    dynamics: Dynamics, pose: Pose, steering: Numbers, steering_rate: Numbers, front_speed: Numbers
-) -> Numbers:
-    """The state (see `model/dynamics.py`) of a stroller without work components; the heading is intrinsic."""
-    axes = dynamics.surface.axes
-    return dynamics.state(padded(pose[:axes]), padded(pose[axes:]), steering, steering_rate, front_speed)
-
-
 def actuation(dynamics: Dynamics, pose: Pose, rates: Rates, with_grip: bool) -> Actuation:
     """Force, torque and contact forces of a motion."""
     components, body = len(pose), dynamics.body
     values = (pose, rates.steering, rates.steering_rate, rates.front_speed)
-    state = state_of(dynamics, *values)
+
+    def state_of(pose: Pose, steering: Numbers, steering_rate: Numbers, front_speed: Numbers) -> Numbers:
+        return dynamics.state(*frame_of(dynamics, pose)[:2], steering, steering_rate, front_speed)
+
+    state = state_of(*values)
     geometry, coasting = dynamics.geometry(state), dynamics.field(jnp.zeros(()), state)
-
-    def momenta(*values: Array) -> Float[Array, " 2"]:
-        return state_of(dynamics, *values)[components + 1 : components + 3]
-
     changes = (coasting[:components], rates.steering_rate, rates.steering_acceleration, rates.front_acceleration)
-    _, (momentum_rate, fork_acceleration) = jax.jvp(momenta, values, changes)
+    momentum_rate, fork_acceleration = jax.jvp(state_of, values, changes)[1][components + 1 : components + 3]
     torque = body.steering_inertia * (fork_acceleration - coasting[components + 2])
     momentum_change = momentum_rate - coasting[components + 1]
     if dynamics.absolute is not None:
@@ -194,7 +186,7 @@ class Task(eqx.Module):
         return cls(
             dynamics=problem.scene.dynamics,
             footprint=problem.footprint,
-            obstacles=Obstacles.of(problem.obstacles),
+            obstacles=Obstacles.of(problem.standing),
             start=(problem.start_pose, launch.steering, launch.steering_rate, launch.speed / jnp.cos(launch.steering)),
             goal=(problem.goal_pose, goal.speed),
             has_heading=jnp.asarray(0.0 if goal.heading is None else 1.0),
@@ -224,7 +216,7 @@ def drive_from(
 
     def rate(u: Numbers | float, pose: Pose) -> Pose:
         steering, front_speed = weighted(basis(u)[0], window)
-        state = state_of(dynamics, pose, steering, jnp.zeros(()), front_speed)
+        state = dynamics.state(*frame_of(dynamics, pose)[:2], steering, jnp.zeros(()), front_speed)
         return duration * dynamics.field(jnp.zeros(()), state)[: len(pose)]
 
     k1 = rate(part, pose)
@@ -514,13 +506,9 @@ class Drive(eqx.Module):
         part, and torque [N m]."""
         part = jnp.asarray(t) / self.duration
         per_second = (len(self.steering) - ORDER + 1) / self.duration
-        return (
-            evaluate(self.steering, part),
-            evaluate(self.steering, part, 1) * per_second,
-            evaluate(self.front_speed, part),
-            evaluate(self.force, part),
-            evaluate(self.torque, part),
-        )
+        angle, rate = evaluate(self.steering, part), evaluate(self.steering, part, 1) * per_second
+        speed, force, torque = (evaluate(spline, part) for spline in (self.front_speed, self.force, self.torque))
+        return angle, rate, speed, force, torque
 
     def held(
         self, motion: Motion, angle: Numbers, rate: Numbers, speed: Numbers, force: Numbers, torque: Numbers
@@ -560,16 +548,11 @@ def drive_along(dynamics: Dynamics, pose: Pose, coefficients: Float[Array | np.n
     """The input that gives a stroller, from a pose, the steering angle and the speed of two splines."""
     duration, splines, body = jnp.asarray(t1, dtype=float), jnp.asarray(coefficients), dynamics.body
     force, torque, weight = _needed(dynamics, pose, splines, duration)
-    return Drive(
-        duration,
-        *splines.T,
-        force=jnp.asarray(interpolate(np.asarray(force))),
-        torque=jnp.asarray(interpolate(np.asarray(torque))),
-        weight=weight,
-        speed_gain=SPEED_RATE * body.mass,
-        angle_gain=STEERING_RATE**2 * body.steering_inertia,
-        rate_gain=2.0 * STEERING_RATE * body.steering_inertia,
-    )
+    force, torque = (jnp.asarray(interpolate(np.asarray(values))) for values in (force, torque))
+    inertia, (steering, front_speed) = body.steering_inertia, splines.T
+    # Of the speed, the steering angle and its rate.
+    gains = SPEED_RATE * body.mass, STEERING_RATE**2 * inertia, 2.0 * STEERING_RATE * inertia
+    return Drive(duration, steering, front_speed, force, torque, weight, *gains)
 
 
 class Tracker(eqx.Module):

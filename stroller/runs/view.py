@@ -89,9 +89,9 @@ def grouped(groups: list[list[tuple[int, Trajectory]]], names: list[str]) -> lis
     return stages
 
 
-def ground_of(rides: list[Trajectory], normal: np.ndarray) -> views.Arena:
-    """The part of the ground on which rides take place."""
-    scene, points = rides[0].model.scene, np.concatenate([np.asarray(ride.position) for ride in rides])
+def ground_of(rides: list[Trajectory], normal: np.ndarray, *more: np.ndarray) -> views.Arena:
+    """The part of the ground on which rides take place, with more points [m]."""
+    scene, points = rides[0].model.scene, np.concatenate([*(np.asarray(ride.position) for ride in rides), *more])
     length = float(scene.body.wheelbase)
     return views.arena(scene.surface, points, normal, 3.0 * length, length)
 
@@ -192,10 +192,8 @@ def refined(run: Trajectory, radius: float) -> tuple[np.ndarray, Callable[[Array
     gaps = np.diff(times)
     roll_angles = np.maximum(np.abs(run.speed), np.abs(run.front_speed)).max() * gaps / radius
     parts = np.clip(np.ceil(roll_angles / ROLL_PER_FRAME), 1, 20).astype(int)
-    refined_times = np.concatenate(
-        [a + (b - a) * np.arange(n) / n for a, b, n in zip(times, times[1:], parts, strict=False)]
-    )
-    refined_times = np.append(refined_times, times[-1])
+    pieces = [a + (b - a) * np.arange(n) / n for a, b, n in zip(times, times[1:], parts, strict=False)]
+    refined_times = np.concatenate([*pieces, times[-1:]])
     return refined_times, lambda values: CubicSpline(times, np.asarray(values))(refined_times)
 
 
@@ -204,9 +202,7 @@ def vehicle(length: float, colour: int) -> tuple[views.Mesh, ...]:
     half, thickness = TRACK * length / 2.0, 0.025 * length
     low, high = 0.12 * length, 0.62 * length
     handle = [(-0.55 * length, sign * 0.3 * half, 0.95 * length) for sign in (1.0, -1.0)]
-    posts = [
-        views.bar((0.0, 0.3 * half * sign, low), handle[k], thickness, views.DARK) for k, sign in enumerate((1.0, -1.0))
-    ]
+    posts = [views.bar((0.0, end[1], low), end, thickness, views.DARK) for end in handle]
     return (
         views.bar((0.0, -half, 0.0), (0.0, half, 0.0), thickness, views.DARK),
         views.bar((0.0, 0.0, 0.0), (0.92 * length, 0.0, 0.30 * length), thickness, views.DARK),

@@ -20,7 +20,7 @@ from stroller import __main__ as job
 from stroller.planning import planner as planner_module
 from stroller.planning.plan import TIMES, planned_stage, seen_along
 from stroller.planning.planner import proposed
-from stroller.planning.problem import checked_problem, disc_distance, separation
+from stroller.planning.problem import Obstacles, checked_problem, corners_of, disc_distance, separation
 from stroller.planning.search import Costs, Search, paths_of, prices
 from stroller.planning.transcription import LIMIT_RESERVE, Rates, Task, actuation, drive_along, evaluate, interpolate
 
@@ -182,14 +182,23 @@ def test_a_plan_on_a_curved_ground_is_drawn_in_space(parked, heading):
     """With the ground, the vehicle, and the goal, which lie on the ground."""
     scene, launch = stroller.presets.bowl(), stroller.Launch((0.0, -1.0), 0.3, 0.5)
     run, length = stroller.simulate(scene, launch, 1.0), float(scene.body.wheelbase)
-    problem = checked_problem(scene, launch, stroller.Goal((0.3, -0.9), heading), 1.0)
+    disc = stroller.Disc((-0.5, -1.0), 0.3)
+    problem = checked_problem(scene, launch, stroller.Goal((0.3, -0.9), heading), 1.0, [disc])
     plan = dataclasses.replace(parked[2], run=run, problem=problem, candidates=np.asarray(run.position)[None])
     above = plan.plot().axes[0]
     assert above.name == "3d"
     lines = {line.get_label(): np.array(line.get_data_3d()).T for line in above.lines}
     assert_close(lines["rear axle"], run.position)
-    # A line for each number of the ground's grid, the candidate, the outlines of the vehicle, the path and the goal.
-    assert len(above.lines) > 13 + 3 + 5
+    # A line for each number of the ground's grid, the obstacle, the candidate, the vehicle, the path and the goal.
+    assert len(above.lines) > 13 + 4 + 5
+    centre, _, _, up = in_space(scene.surface, disc.centre, 0.0)
+    (foot,) = [line for line in (np.array(line.get_data_3d()).T for line in above.lines) if len(line) == 49]
+    assert_close(scene.surface.offset(tuple(foot.T)), np.zeros(49), atol=1e-9)
+    assert_close(np.linalg.norm(np.cross(foot - centre, up), axis=1), np.full(49, 0.3), atol=2e-3)
+    (body,) = [body for show in planned_stage(plan).shows for body in show.bodies if body.name == "obstacles"]
+    # It rises on the stroller's side, from its own foot.
+    heights = (body.meshes[0].vertices - centre) @ -up
+    assert_close(heights.max(), 0.5 * length + ((foot - centre) @ -up).max(), atol=1e-9)
     goal = lines["goal"]
     assert len(goal) == (1 if heading is None else 5)
     assert_close(scene.surface.offset(tuple(goal.T)), np.zeros(len(goal)), atol=1e-2 * length)
@@ -581,15 +590,189 @@ def test_plans_know_one_vehicle(scene, fix):
         stroller.plan(scene, START, GOAL, 12.0)
 
 
-def test_obstacles_need_x_and_y():
-    with pytest.raises(ValueError, match="obstacles: a Spheroid names its places"):
-        stroller.plan(
-            stroller.presets.bowl(),
-            stroller.Launch((0.0, -1.0), 0.0, 0.0),
-            stroller.Goal((1.0, -1.0)),
-            5.0,
-            obstacles=GAP,
+def on(surface, side=None):
+    return stroller.Scene(BODY, surface, SCENE.friction, side=side)
+
+
+#: Grounds without x and y: scene, start, goal, and obstacles between them.
+CURVED = {
+    "cylinder": (
+        on(stroller.Cylinder(1.0), "outside"),
+        (-1.5, 3.0, 0.0),
+        (1.5, 3.2, 0.0),
+        [stroller.Disc((0.0, 3.1), 0.3), stroller.Box((0.0, 0.0), (0.4, 0.3))],
+    ),
+    "spheroid": (
+        on(stroller.Spheroid(6.0, 3.0), "inside"),
+        (0.0, -1.2, 0.3),
+        (0.8, -1.1, 1.0),
+        [stroller.Box((0.4, -1.2), (0.4, 0.4), 0.2)],
+    ),
+    "torus": (
+        on(stroller.Torus(2.0, 0.8), "outside"),
+        (0.0, 1.5, 0.0),
+        (1.2, 1.5, 0.0),
+        [stroller.Disc((0.6, 1.6), 0.25), stroller.Box((0.4, 2.2), (0.2, 0.3))],
+    ),
+}
+
+
+def curved_problem(name, obstacles=None):
+    scene, start, goal, others = CURVED[name]
+    launch, target = stroller.Launch(start[:2], start[2], 0.0), stroller.Goal(goal[:2], goal[2])
+    problem = {"scene": scene, "launch": launch, "goal": target, "t1": 12.0, "obstacles": obstacles or others}
+    return problem | {"limits": LIMITS, "footprint": FOOTPRINT}
+
+
+def in_space(surface, place, angle):
+    """The point of a place, the directions at an angle from east and at a right angle to it, and the normal."""
+    parts = [np.array([float(part) for part in vector]) for vector in surface.chart(tuple(map(jnp.asarray, place)))]
+    position, east, north = parts
+    along, across = np.cos(angle) * east + np.sin(angle) * north, np.cos(angle) * north - np.sin(angle) * east
+    return position, along, across, np.cross(east, north)
+
+
+def gaps_of_points(scene, obstacles, poses):
+    """Distances of points all around the footprint from each obstacle, which is a cylinder or a block in space: in its plane,
+    and along its normal."""
+    part, gaps = np.linspace(0.0, 1.0, 41), []
+    x, y = -0.1 + 0.5 * part, -0.125 + 0.25 * part
+    around = [(x, 0 * x - 0.125), (x, 0 * x + 0.125), (0 * y - 0.1, y), (0 * y + 0.4, y)]
+    own = np.concatenate([np.stack(side, axis=-1) for side in around])
+    place, heading = poses[:, None, :3], poses[:, None, 3:]
+    normal = scene.surface.normal(tuple(np.moveaxis(place, -1, 0)))
+    normal = np.stack([np.zeros(place.shape[:2]) if part is None else np.asarray(part) for part in normal], axis=-1)
+    points = place + own[:, :1] * heading + own[:, 1:] * np.cross(normal, heading)
+    for obstacle in obstacles:
+        is_disc = isinstance(obstacle, stroller.Disc)
+        position, *axes = in_space(scene.surface, obstacle.centre, 0.0 if is_disc else float(obstacle.angle))
+        u, v, height = np.moveaxis((points - position) @ np.array(axes).T, -1, 0)
+        if is_disc:
+            reach = float(obstacle.radius)
+            away = np.hypot(u, v) - reach
+        else:
+            half = np.array(obstacle.size, dtype=float) / 2.0
+            reach, away = np.hypot(*half), -np.minimum(half[0] - np.abs(u), half[1] - np.abs(v))
+            outside = np.hypot((np.abs(u) - half[0]).clip(0.0), (np.abs(v) - half[1]).clip(0.0))
+            away = np.where(away > 0.0, outside, away)
+        gaps.append([away, np.abs(height) - reach])
+    return np.moveaxis(gaps, 0, -1)
+
+
+@pytest.mark.parametrize(
+    "name", ["cylinder", *(pytest.param(slow, marks=pytest.mark.slow) for slow in CURVED if slow != "cylinder")]
+)
+def test_a_plan_goes_around_obstacles_on_any_ground(name):
+    """Driven again at a tight tolerance, with every point of its edge in space beside the obstacles in space."""
+    problem = curved_problem(name)
+    plan, scene, goal = stroller.plan(**problem, progress=False), problem["scene"], problem["goal"]
+    assert plan.reached, str(plan)
+    run = stroller.simulate(scene, problem["launch"], plan.t1, plan.input, times=times_of(plan), tolerance=1e-10)
+    poses = np.asarray(run.state[:, :6])
+    target, along, _, _ = in_space(scene.surface, goal.place, float(goal.heading))
+    assert np.linalg.norm(poses[-1, :3] - target) < 0.05
+    assert np.linalg.norm(poses[-1, 3:] - along) < 0.05
+    gaps = gaps_of_points(scene, problem["obstacles"], poses).max(axis=0)
+    assert gaps.min() > 0.0
+    assert_close(plan.clearance, gaps.min(), atol=1e-4)
+    # The straight way would touch one.
+    start, end = (np.asarray(pose) for pose in (plan.problem.start_pose, plan.problem.goal_pose))
+    straight = start + np.linspace(0.0, 1.0, 99)[:, None] * (end - start)
+    place = np.stack(scene.surface.nearest(tuple(straight[:, :3].T)), axis=-1)
+    straight = np.concatenate([place, straight[:, 3:]], axis=1)
+    assert gaps_of_points(scene, problem["obstacles"], straight).max(axis=0).min() < 0.0
+
+
+@pytest.mark.parametrize("name", CURVED)
+def test_distances_in_space_are_those_of_points(name):
+    """At random poses all over the ground, also behind obstacles; and the bound of the optimiser is never greater."""
+    problem, random, poses = checked_problem(**curved_problem(name)), np.random.default_rng(0), []
+    scene = problem.scene
+    for mu, eta, angle in random.uniform(-1.5, 1.5, (300, 3)) * [2.0, 1.0, 2.0]:
+        position, along, _, _ = in_space(scene.surface, (mu, eta if name == "spheroid" else 2.0 * eta), angle)
+        poses.append(np.concatenate([position, along]))
+    poses = np.array(poses)
+    corners = np.asarray(corners_of(scene.dynamics, FOOTPRINT, jnp.asarray(poses.T)))
+    gaps, sampled = problem.gaps(corners), gaps_of_points(scene, problem.obstacles, poses)
+    apart = gaps > 0.0
+    assert 0.5 < apart.mean() < 1.0
+    assert np.all(sampled.max(axis=0).min(axis=1)[apart] > gaps[apart] - 1e-6)
+    # Half the distance between two points of the edge is 0.006 m.
+    assert np.all(sampled.min(axis=2).max(axis=0)[apart] < gaps[apart] + 0.0065)
+    bounds = np.asarray(Obstacles.of(problem.standing).gaps(jnp.asarray(corners)))
+    bounds = bounds[:, bounds.max(axis=0) < 1e6]
+    order = np.argsort([isinstance(part, stroller.Disc) for part in problem.obstacles], kind="stable")
+    assert np.all(bounds <= gaps[:, order] + 1e-9)
+    assert np.all((bounds > 0.0) == apart[:, order])
+
+
+def test_an_upright_footprint_is_seen_as_a_line():
+    """Its edges along the normal of an obstacle have no length there, and distances still have slopes."""
+    obstacles = Obstacles.of(
+        [(stroller.Box((0.0, 0.0), (1.0, 1.0)), np.eye(4, 3, -1)), (stroller.Disc((0.0, 0.0), 0.5), np.eye(4, 3, -1))]
+    )
+    corners = jnp.array([[2.0, -0.5, 0.0], [2.0, 0.5, 0.0], [2.0, 0.5, -1.0], [2.0, -0.5, -1.0]])
+    gaps, slopes = obstacles.gaps(corners)[::8], jax.jacfwd(obstacles.gaps)(corners)
+    assert_close(gaps, [1.5, 1.5])
+    assert np.all(np.isfinite(slopes))
+    assert_close(np.sum(slopes[::8], axis=1), [[1.0, 0.0, 0.0]] * 2, atol=1e-9)
+
+
+def test_a_goal_on_a_cylinder_can_be_walled_in():
+    walls = [stroller.Box((1.5 + y, 3.2), (0.1, 1.4)) for y in (-0.6, 0.8)]
+    walls += [stroller.Box((1.6, 3.2 + angle), (1.5, 0.1)) for angle in (-0.6, 0.6)]
+    problem = checked_problem(**curved_problem("cylinder", walls))
+    _, reason = paths_of(problem, prices(problem, 1, 0, np.random.default_rng(0)))
+    assert re.match(r"no path to the goal was found; the nearest ended \S+ m from the goal", reason)
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "message"),
+    [
+        (stroller.Disc((0.0, -1.2), 0.1), r"launch: at place = \(0, -1.2\) the footprint overlaps obstacles\[0\]"),
+        (stroller.Box((0.0, -2.0), (0.1, 0.1)), r"obstacles\[0\]: place\[1\] = -2.0 must be"),
+        (stroller.Disc((0.0, 0.0, 1.0), 0.1), r"obstacles\[0\]: distance = -?[0-9.]+ must be"),
+    ],
+)
+def test_obstacles_are_on_the_ground(obstacle, message):
+    with pytest.raises(ValueError, match=message):
+        stroller.plan(**curved_problem("spheroid", [obstacle]))
+
+
+def test_an_obstacle_can_be_named_by_a_point_in_space():
+    position, _, _, _ = in_space(CURVED["torus"][0].surface, (0.6, 1.6), 0.0)
+    discs = [stroller.Disc((0.6, 1.6), 0.25), stroller.Disc(position, 0.25)]
+    frames = [
+        checked_problem(CURVED["torus"][0], stroller.Launch((0.0, 1.5), 0.0, 0.0), GOAL, 1.0, [disc]).standing[0][1]
+        for disc in discs
+    ]
+    assert_close(*frames, atol=1e-9)
+    ((disc, _),) = checked_problem(SCENE, START, GOAL, 1.0, [stroller.Disc((5.0, 4.0, 0.0), 0.25)]).standing
+    assert_close(disc.centre, [5.0, 4.0])
+
+
+def test_a_problem_without_obstacles_has_no_gaps():
+    problem = checked_problem(SCENE, START, GOAL, 1.0, footprint=FOOTPRINT)
+    assert [len(gaps) for gaps in problem.gaps_at_ends.values()] == [0, 0]
+    assert_close(problem.clearance, 0.04 * 0.5)
+
+
+def test_a_planner_sees_obstacles_in_space():
+    """An obstacle turned about the axis of the cylinder with the stroller looks the same."""
+    decisions = []
+    for turn, eta in ((0.0, 3.1), (0.4, 3.1), (0.0, 3.3)):
+        launch, goal = stroller.Launch((-1.5, 3.0 + turn), 0.0, 0.0), stroller.Goal((1.5, 3.2 + turn), 0.0)
+        problem = checked_problem(CURVED["cylinder"][0], launch, goal, 9.0, [stroller.Disc((0.0, eta + turn), 0.3)])
+        task = Task.of(problem, 3.0, 9.0, 0.0)
+        planner = planner_module.Planner.untrained(task, jax.random.key(0))
+        # It also knows its place; here, always the same one.
+        first = planner.of_step.layers[0]
+        planner = eqx.tree_at(
+            lambda planner: planner.of_step.layers[0].weight, planner, first.weight.at[:, 21:27].set(0.0)
         )
+        decisions.append(planner.decide(task, problem.start_pose, jnp.zeros(15)))
+    assert_close(decisions[0], decisions[1], atol=1e-6)
+    assert np.abs(decisions[0] - decisions[2]).max() > 1e-5
 
 
 def test_a_goal_is_on_the_ground():
@@ -603,7 +786,9 @@ def test_a_goal_is_on_the_ground():
     ("build", "message"),
     [
         (lambda: stroller.Box((0.0, 0.0), (1.0, 0.0)), r"size\[1\] = 0.0 must be greater than 0"),
-        (lambda: stroller.Box(0.0, (1.0, 1.0)), "centre = 0.0 must be a pair of numbers"),
+        (lambda: stroller.Box(0.0, (1.0, 1.0)), r"centre = 0.0 must be a pair of numbers, or \(x, y, z\)"),
+        (lambda: stroller.Box((0.0, [0.0, 1.0]), (1.0, 1.0)), "centre = .* must be a pair of numbers"),
+        (lambda: stroller.Box((0.0, 0.0), (1.0, 1.0, 1.0)), "size = .* must be a pair of numbers$"),
         (lambda: stroller.Disc((0.0, 0.0), -1.0), "radius = -1.0 must be greater than 0"),
         (lambda: stroller.Footprint(0.5, 0.2, 0.6), "rear = 0.6 must be at most 0.5"),
         (lambda: stroller.Limits(speed=(0.5, -0.5)), r"speed\[1\] = -0.5 must be greater than 0.5"),
