@@ -269,10 +269,15 @@ def described(result: PyTree) -> str:
 
 def contents(module: PyTree, with_units: bool = True) -> list[tuple[str, str]]:
     """The fields of a module as (name, value as text); omitted fields are left out."""
-    fields = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
-    units = getattr(module, "units", {})
-    fields = [(name, value, units.get(name, "1") if with_units else None) for name, value in fields]
-    return [(name, as_text(value, unit)) for name, value, unit in fields if value is not None]
+    units, rows = getattr(module, "units", {}), []
+    for field in dataclasses.fields(module):
+        value = getattr(module, field.name, None)
+        if value is not None and field.name != "unit":
+            # A launch knows the unit in which it was stated.
+            unit, factor = in_unit(units.get(field.name, "1"), getattr(module, "unit", None) if with_units else None)
+            value = value if factor == 1.0 else jax.tree.map(lambda part, factor=factor: factor * part, value)
+            rows.append((field.name, as_text(value, unit if with_units else None)))
+    return rows
 
 
 def suspected_gravity(value: float) -> str | None:

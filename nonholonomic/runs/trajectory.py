@@ -351,7 +351,7 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
         """
         require_one_run(self, "explore", "")
         model, t1 = self.of_page
-        return explore_model(model, path, sliders, t1, unit)
+        return explore_model(model, path, sliders, t1, unit or self.unit)
 
     @status_line("reading off")
     def to_table(self) -> Table:

@@ -495,6 +495,9 @@ class Tabular(abc.ABC):
     #: The names that a message for an unknown attribute lists; empty for the ordinary message.
     readable: ClassVar[tuple[str, ...]] = ()
 
+    #: The units in which pictures show the numbers of the run, unless others are asked for.
+    unit: ClassVar[str | Sequence[str] | None] = None
+
     #: The quantities that `run[name]` returns.
     quantities: ClassVar[Mapping[str, Quantity]] = MappingProxyType({})
 
@@ -580,7 +583,7 @@ class Tabular(abc.ABC):
                 quantities, ax = (), first
             else:
                 quantities, others = (), first
-        runs = [self, *require_others(self, others, "to_table")]
+        runs, unit = [self, *require_others(self, others, "to_table")], unit or self.unit
         labels = self.labels_of(runs, unit) if label is None else [label] if isinstance(label, str) else label
         if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
             raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
@@ -607,7 +610,7 @@ class Tabular(abc.ABC):
         require_package("matplotlib", "plot", "portrait")
         require_unit(unit)
         x, y = x or self.portrait_axes[0], y or self.portrait_axes[1]
-        return draw_portrait(self.table_of((x, y)).drawn_in(unit, x, y), x, y, ax)
+        return draw_portrait(self.table_of((x, y)).drawn_in(unit or self.unit, x, y), x, y, ax)
 
     def __getitem__(self, name: str) -> Any:
         """A quantity by its name, also inside transformations.

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -337,6 +337,9 @@ views.ready.then((player) => player.film([REQUEST], (share) => { post("share", S
 class Viewable(abc.ABC):
     """A run that can be drawn, alone or with others."""
 
+    #: The units in which pictures, pages and texts show the numbers of the run, unless others are asked for.
+    unit: ClassVar[Unit] = None
+
     @abc.abstractmethod
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Unit = None) -> list[Stage]:
         """This run and others as stages: each on its own stage, or all on that of the first. **Arguments:** `unit`: unit of
@@ -441,6 +444,7 @@ class Viewable(abc.ABC):
     def _stages(self, others: Sequence[Any], overlaid: bool, unit: Unit) -> list[Stage]:
         """The stages in a unit, after a check of the unit and that the others are runs of the same package."""
         require_unit(unit)
+        unit = unit or self.unit
         return curves_in(self.stages(require_others(self, others, "stages"), overlaid, unit), unit)
 
 

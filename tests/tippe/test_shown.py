@@ -184,6 +184,27 @@ def test_quantities_are_drawn_over_time_by_name_and_in_degrees(run):
     assert legend.get_texts()[1].get_text() == f"θ(0) = {theta:.3g} deg, {spin:.4g} rpm, …"
 
 
+def test_a_launch_in_degrees_is_shown_in_degrees(run):
+    """In texts, pictures and pages, unless another unit is asked for; the numbers themselves are in SI units."""
+    launch = tippe.Launch.degrees(theta=6, rpm=1500)
+    assert repr(launch) == "Launch(theta=6 deg, spin=1500 rpm, eta=0 deg, azimuth=0 deg)"
+    assert_close(launch.theta, np.radians(6.0), rtol=1e-15)
+    in_degrees = tippe.simulate(run.scene, launch, 1.0, tolerance=1e-6)
+    assert in_degrees.launch is launch
+    assert f"theta: 6 to {np.degrees(in_degrees.theta[-1]):.6g} deg" in str(in_degrees)
+    (panel,) = in_degrees.plot("theta").axes
+    assert_close(panel.get_lines()[0].get_ydata(), np.degrees(in_degrees.theta))
+    assert in_degrees.plot("theta", unit="rad").axes[0].get_ylabel() == "inclination θ [rad]"
+    # A quantity without an angle, in its own unit.
+    assert in_degrees.plot("energy").axes[0].get_ylabel() == "energy [J]"
+    assert in_degrees.portrait().axes[0].get_xlabel() == "inclination θ [deg]"
+    assert "normal to axis [deg]" in in_degrees.view().html
+    assert "normal to axis [deg]" in in_degrees.explore().html
+    several = tippe.InversionTimes([launch, tippe.Launch.degrees(8, 1500)], [5.0, 6.0], 0.1, t1=20.0).launch
+    assert_close(several.theta, np.radians([6.0, 8.0]), rtol=1e-15)
+    assert several.unit == launch.unit
+
+
 def test_labels_are_what_differs(run):
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.2))
     other = tippe.simulate(scene, tippe.Launch(0.1, 155.0), 1.0, tolerance=1e-6)

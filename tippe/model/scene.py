@@ -60,6 +60,10 @@ HALF_TURN = {"range": {"at_least": -math.pi, "at_most": math.pi, "unit": "rad"}}
 SPINS = "Launch takes spin in rad/s, Launch.degrees takes rpm: 20 turns a second are spin=125.7 or rpm=1200"
 
 
+#: Units of the texts and pictures of `Launch.degrees`. Where a picture has no angle, it has a time.
+IN_DEGREES = ("deg", "rpm", "s")
+
+
 class Launch(Bounded):
     """A launch: position on the arena, inclination, spin and velocity of the top.
 
@@ -80,6 +84,8 @@ class Launch(Bounded):
     - `velocity`: velocity of the sphere's centre, or of the centre of mass for other bodies, along (t1, t2), (2,)
       [m/s]; zero by default.
     - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), in addition to the spin about the axis; zero by default.
+    - `unit`: units in which texts, pictures and pages of the launch and its runs show numbers, as for `plot`; the numbers
+      themselves are in SI units.
 
     **Raises:** `ValueError` for numbers outside these ranges.
 
@@ -116,6 +122,7 @@ class Launch(Bounded):
         default=None,
         kw_only=True,
     )
+    unit: tuple[str, ...] | None = eqx.field(static=True, default=None, kw_only=True)
 
     @classmethod
     @explaining
@@ -131,7 +138,7 @@ class Launch(Bounded):
         - `eta`, `azimuth`: as for `Launch`, in degrees.
         - `others`: `place`, `velocity` and `angular_velocity`, as for `Launch`, in SI units.
 
-        **Returns:** a `Launch` with numbers in SI units.
+        **Returns:** a `Launch` with numbers in SI units, whose texts and pictures are in degrees and rpm.
 
         **Raises:** `ValueError` for numbers outside these ranges.
 
@@ -139,8 +146,9 @@ class Launch(Bounded):
 
         ```
         >>> import tippe
-        >>> tippe.Launch.degrees(theta=6, rpm=1800)
-        Launch(theta=0.10472 rad, spin=188.496 rad/s, eta=0 rad, azimuth=0 rad)
+        >>> launch = tippe.Launch.degrees(theta=6, rpm=1800)
+        >>> launch, launch.spin.round(2).item()
+        (Launch(theta=6 deg, spin=1800 rpm, eta=0 deg, azimuth=0 deg), 188.5)
 
         ```
         """
@@ -149,7 +157,7 @@ class Launch(Bounded):
         require(azimuth, "azimuth", why="in degrees")
         require(rpm, "rpm")
         theta, eta, azimuth = (jnp.radians(as_number(angle)) for angle in (theta, eta, azimuth))
-        return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others)
+        return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **{"unit": IN_DEGREES} | others)
 
     def suspicion(self) -> str | None:
         fastest = largest(self.spin)

@@ -124,7 +124,10 @@ class TopModel(AbstractSceneModel):
     """
 
     scene: Scene
-    launch: Launch
+    # Without the unit of its texts, which no program needs.
+    launch: Launch = eqx.field(
+        converter=lambda launch: dataclasses.replace(launch, unit=None) if launch.unit else launch
+    )
     angle: Any = None
     event: EventFunction | None = None
     reverses: bool = eqx.field(static=True, default=False)

@@ -280,6 +280,10 @@ class AbstractTrajectory(AbstractRun):
         return model_of(self.scene, self.launch), float(self.end_time)
 
     @property
+    def unit(self) -> Unit:
+        return None if self.launch is None else self.launch.unit
+
+    @property
     def codes(self) -> Int[Array, "..."] | str | None:
         return self.status
 
@@ -347,9 +351,10 @@ class AbstractTrajectory(AbstractRun):
 
     def in_words(self) -> str:
         word = self.status if isinstance(self.status, str) else Status(int(self.status)).word
+        angle, factor = in_unit("rad", self.unit)
         lines = [
             f"Trajectory of {len(self.t)} times, {word} at {float(self.end_time):.6g} s",
-            f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
+            f"  theta: {factor * float(self.theta[0]):.6g} to {factor * float(self.theta[-1]):.6g} {angle}",
         ]
         if self.dense is not None and isinstance(self.scene.body, AbstractBody):
             lines.append(f"  {self._whether_it_turned_over}")

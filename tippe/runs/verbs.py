@@ -1,5 +1,6 @@
 """The functions for launches of a top: single runs, inversion times, tables."""
 
+import dataclasses
 import math
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
@@ -581,7 +582,8 @@ def simulate(
     ```
     """
     check_run(scene, launch, t1, tolerance, "jax.vmap(simulate) takes lists, and so does trajectory_table")
-    return simulate_launch(TopModel(scene=scene, launch=launch), t1, times, tolerance, solver, adjoint)
+    run = simulate_launch(TopModel(scene=scene, launch=launch), t1, times, tolerance, solver, adjoint)
+    return run if launch.unit is None else dataclasses.replace(run, launch=launch)
 
 
 @status_line("simulating")

@@ -273,7 +273,7 @@ def explore(
     ```
     """
     check_run(scene, launch, t1, TOLERANCE)
-    return explore_model(TopModel(scene=scene, launch=launch), path, sliders, float(t1), unit)
+    return explore_model(TopModel(scene=scene, launch=launch), path, sliders, float(t1), unit or launch.unit)
 
 
 @page_of.register(TopModel)
