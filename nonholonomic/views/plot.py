@@ -586,7 +586,7 @@ def _draw_distribution(fit: "Identification", name: str, axes: "Axes", unit: Uni
     if distribution.kind == "weights":
         used = distribution.weights > 0.0
         values = fit.density.problem.unknowns.values(distribution.points[used])[:, list(fit.estimates).index(name)]
-        edges = factor * np.linspace(*ends, BARS + 1)
+        edges = (factor * np.linspace(*ends, BARS + 1)).tolist()
         axes.hist(factor * np.asarray(values), edges, weights=distribution.weights[used], color="C0", alpha=0.7)
     else:
         deviations = np.linspace(-DEVIATIONS, DEVIATIONS, 101)
