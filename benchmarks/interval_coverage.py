@@ -256,15 +256,15 @@ def own() -> Setting:
     def exact(**values: float) -> np.ndarray:
         restitution, height = values.values()
         ball = nonholonomic.Hybrid([Ball(restitution, 0.2)])
-        return np.asarray(nonholonomic.simulate(ball, [height, 0.0], 2.0, times=clock)["y[0]"])
+        return np.asarray(nonholonomic.simulate(ball, [height, 0.0], 2.0, times=clock)["y0"])
 
     def data(exact: np.ndarray, random: np.random.Generator) -> Any:
-        return nonholonomic.Recording([1.0, 0.0], clock, exact + 0.03 * random.normal(size=40), 0.03, "y[0]")
+        return nonholonomic.Recording([1.0, 0.0], clock, exact + 0.03 * random.normal(size=40), 0.03, "y0")
 
     def fit(data: nonholonomic.Recording, free: dict[str, tippe.Free]) -> Any:
         return nonholonomic.identify(nonholonomic.Hybrid([Ball(0.8, 0.2)]), data, free, progress=False)
 
-    return Setting({"restitution": Number(0.8, bounds=(0.0, 1.0)), "start.y[0]": Number(1.0, 1.05)}, exact, data, fit)
+    return Setting({"restitution": Number(0.8, bounds=(0.0, 1.0)), "start[0]": Number(1.0, 1.05)}, exact, data, fit)
 
 
 def decay() -> Setting:

@@ -252,7 +252,7 @@ def main() -> None:
 
     balls = {
         "nonholonomic.sweep": table_of(
-            nonholonomic.Hybrid([Ball()]), [1.0, 0.0, 0.0], 20.0, tenth, {"start.y[0]": heights}
+            nonholonomic.Hybrid([Ball()]), [1.0, 0.0, 0.0], 20.0, tenth, {"start[0]": heights}
         ),
         "Diffrax, vmapped": lambda tolerance: times_of(ball_by_diffrax, tolerance, jnp.asarray(heights), 0.8),
     }

@@ -1,7 +1,7 @@
 """The parameters of modules by name.
 
 Those of a scene are the numbers in its fields, such as `"scene.body.offset"` or `"launch.place[0]"`; the modules check the
-values that replace them. Those of a user's system are all its numbers, such as `"system.modes[0].drag"`, `"start.y[1]"`,
+values that replace them. Those of a user's system are all its numbers, such as `"system.modes[0].drag"`, `"start[1]"`,
 `"start.q[0]"` or `"event.level"`, in a form that can be a constant of a program. `"system.modes[*].drag"` is one number for
 all modes that have it.
 """
@@ -363,13 +363,12 @@ def require_apart(argument: str, names: Iterable[str]) -> None:
 
 
 def short_names(names: list[str]) -> dict[str, str]:
-    """For each full name, the part after its last dot; the whole name if several names end alike, and for a component of a
-    start, because its end is the name of a quantity."""
+    """For each full name, the part after its last dot, in the form `start_0`; if several names end alike, the whole
+    name."""
+    table = str.maketrans({"[": "_", "]": None, ".": "_"})
     ends = [name.rpartition(".")[2] for name in names]
-    return {
-        name: name if ends.count(end) > 1 or f".{name}".endswith(f".start.{end}") else end
-        for name, end in zip(names, ends, strict=True)
-    }
+    plain, ends = ([text.replace("[*]", "").translate(table) for text in texts] for texts in (names, ends))
+    return {name: end if ends.count(end) == 1 else text for name, text, end in zip(names, plain, ends, strict=True)}
 
 
 def checks_of(tree: PyTree) -> list[tuple[eqx.Module, type]]:

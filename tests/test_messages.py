@@ -122,7 +122,7 @@ REFUSED = {
     ),
     "a recording of a top without its quantity": (
         lambda: nonholonomic.identify(TOP, nonholonomic.Recording(LAUNCH, [0.1, 0.2], [0.1, 0.1], 0.01), {"mu": 0.3}),
-        "quantity: 'y[0]' (the default) must be one of theta, eta",
+        "quantity: 'y0' (the default) must be one of theta, eta",
     ),
     "a list of launches for event times": (
         lambda: nonholonomic.EventTimes([LAUNCH, LAUNCH], [1.0, 2.0], 0.1, t1=5.0),

@@ -58,7 +58,7 @@ class Quantities:
         columns: list[str] = []
         for word in words:
             if not isinstance(word, str) or (known and word not in known):
-                names = ", ".join(map(repr, known)) or "the names of quantities, such as 'theta' or ('q[0]', 'q[1]')"
+                names = ", ".join(map(repr, known)) or "the names of quantities, such as 'theta' or ('q0', 'q1')"
                 raise ValueError(f"quantity = {shown(word)} must be one of {names}")
             columns += known.get(word, (word,))
         if not columns or len(set(columns)) < len(columns):

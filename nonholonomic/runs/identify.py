@@ -48,7 +48,7 @@ class Recording(AbstractRecording):
     - `value`: (times,) for a single quantity, (times, columns) for several; NaN where a sample is missing.
     - `error`: standard errors: a scalar, (columns,), or of the shape of `value`; with `None`, they are estimated for
       each column from the residuals.
-    - `quantity`: names of the recorded quantities, such as "theta", "speed", "y[0]" or ("q[0]", "q[1]"); a component of a
+    - `quantity`: names of the recorded quantities, such as "theta", "speed", "y0" or ("q0", "q1"); a component of a
       vector is "position.x".
     - `t0`: the clock's reading at the start.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
@@ -61,12 +61,12 @@ class Recording(AbstractRecording):
     **Example:**
 
     >>> import nonholonomic
-    >>> heights = nonholonomic.Recording([1.0, 0.0], [0.1, 0.2], [0.95, 0.80], 0.01, "y[0]")
+    >>> heights = nonholonomic.Recording([1.0, 0.0], [0.1, 0.2], [0.95, 0.80], 0.01, "y0")
     >>> heights.labels
-    ('y[0](0.1 s)', 'y[0](0.2 s)')
+    ('y0(0.1 s)', 'y0(0.2 s)')
     """
 
-    quantity: str | tuple[str, ...] = eqx.field(static=True, default="y[0]", converter=as_quantity)
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="y0", converter=as_quantity)
     input: Any = None
     jumps: Sequence[float] | Array | None = None
     quantities: ClassVar[Quantities] = Quantities({}, {}, ANGLES)
@@ -78,7 +78,7 @@ class Recording(AbstractRecording):
         known = [*model.quantities, *(f"{name}.{part}" for name in vectors for part in model.components[vectors[name]])]
         for name in self.columns:
             if name not in known:
-                default = " (the default)" if self.quantity == "y[0]" else ""
+                default = " (the default)" if self.quantity == "y0" else ""
                 raise ValueError(f"quantity: {name!r}{default} must be one of {', '.join(known)}{likely(name, known)}")
             if name in vectors:
                 raise ValueError(f"quantity: {name!r} has several components: name them, such as '{name}.x'")
@@ -458,8 +458,8 @@ def identify(
       `tippe.identify` and `stroller.identify`.
     - `free`: full name of a parameter -> a `nonholonomic.Free` or only the start value. Examples of names are
       `"scene.friction.mu"` or `"system.modes[0].drag"`, or `"drag"` if no other name ends so, `"modes[*].drag"` for all
-      modes that have a drag, `"launch.theta"`, `"start.y[0]"`, `"start.q[0]"` and `"t0"`, the reading of a recording's
-      clock at the start. `"start.y[0]"` and `"t0"` are the same in all recordings; `"data[1].start.y[0]"` belongs to the
+      modes that have a drag, `"launch.theta"`, `"start[0]"`, `"start.q[0]"` and `"t0"`, the reading of a recording's
+      clock at the start. `"start[0]"` and `"t0"` are the same in all recordings; `"data[1].start[0]"` belongs to the
       second recording, and `"data[*].t0"` is a separate parameter for each. In systems with resets, `"t0"` cannot be
       free.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.result`.

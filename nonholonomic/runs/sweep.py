@@ -141,7 +141,7 @@ def sweep(
       `t1`.
     - `t1`: horizon [s].
     - `axes`: full name of a parameter -> values, such as `{"scene.friction.mu": [0.1, 0.2]}` or
-      `{"system.modes[0].drag": [0.1, 0.2], "start.y[1]": [0.0, 1.0]}`; the end of a name is enough if it is unique. The
+      `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0, 1.0]}`; the end of a name is enough if it is unique. The
       start of an `AbstractSystem` has the names `"start.q[0]"` and `"start.rate[0]"`, and parameters of an event that is
       an `equinox.Module` have names such as `"event.level"`. `"modes[*].drag"` gives all modes that have a drag the same
       value. The first axis varies slowest.
@@ -160,8 +160,8 @@ def sweep(
 
     **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" if the
     run reached `t1`, "stopped" if a mode without a reset ended, "failed", "unresolved" (for example after 2000 resets
-    of your own system), or a word of the system; `end_time` [s]; the state at the end, such as `y[0]`, `q[0]` and
-    `rate[0]`, or `end_theta`; `steps` and `rejected`; and for a system with resets their number, such as `switches`.
+    of your own system), or a word of the system; `end_time` [s]; the state at the end, such as `y0`, `q0` and
+    `rate0`, or `end_theta`; `steps` and `rejected`; and for a system with resets their number, such as `switches`.
     With `sensitivities`, the table also contains the derivative of `time` with respect to each parameter, such as
     `time_by_drag` for `"system.modes[0].drag"`, and for a system with resets `grazes`: 1 if the derivative is NaN
     because the margin of a mode only touched zero. With `errors`, `time_error` and so on are bounds: infinite if the

@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..hybrid import MOST_ROUNDS, hybrid_resets
 from ..integration import AbstractProblem, Settings
 from ..integration.problem import Status, run_bounds
-from ..parameters import of_all_modes, short_names
+from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, likely, readable_unit, require_unit, shown
@@ -457,7 +457,7 @@ class Trajectory(AbstractRun):
     @functools.cached_property
     def resets(self) -> Table:
         """The resets of the run, a `Table` with a row for each: its `time` [s], the indices `mode_before` and
-        `mode_after`, and the components of the state, such as `y[0]_before` and `y[0]_after`. The run is repeated for it.
+        `mode_after`, and the components of the state, such as `y0_before` and `y0_after`. The run is repeated for it.
 
         **Raises:** `ValueError` inside transformations and for a batch of runs: `mode` and `switches` are there.
         """
@@ -555,20 +555,13 @@ class Trajectory(AbstractRun):
         return self._with_resets().to_table()
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
-        """Labels that tell runs apart by the numbers of their systems and starts that differ.
-
-        A number with the same value in all modes that have it counts once, under its name for all modes. All other numbers
-        count under their names in each mode.
-        """
+        """Labels that tell runs apart by the numbers of their systems and starts that differ."""
         models = [run.model for run in runs]
         names = models[0].known
         if any(model.known != names for model in models):
             return Tabular.labels_of(self, runs, unit)
         values = {name: [as_text(model.value(name)) for model in models] for name in names}
-        groups = {name: [single for single in names if single != name == of_all_modes(single)] for name in names}
-        shared = {name for name, group in groups.items() if group and all(values[k] == values[name] for k in group)}
-        names = [name for name in names if name in shared or not (groups[name] or of_all_modes(name) in shared)]
-        texts = [[f"{label} {text}" for text in values[name]] for name, label in short_names(names).items()]
+        texts = [[f"{label} {text}" for text in values[name]] for name, label in brief_names(values).items()]
         numbers = list(zip(*texts, strict=True))
         return distinguishing_labels(numbers) if len(set(numbers)) > 1 else Tabular.labels_of(self, runs, unit)
 
@@ -593,6 +586,21 @@ class Trajectory(AbstractRun):
         if self.status in REASONS:
             lines.append(f"  {REASONS[self.status]}")
         return "\n".join(lines)
+
+
+def brief_names(values: dict[str, list[str]]) -> dict[str, str]:
+    """The parameters that a label may name: full name -> its last part, or the full name if several names end alike.
+
+    A parameter with the same value in all modes that have it counts once, under its name for all modes. All other
+    parameters count under their names in each mode.
+
+    **Arguments:** `values`: full name -> the value in each run.
+    """
+    groups = {name: [single for single in values if single != name == of_all_modes(single)] for name in values}
+    shared = {name for name, group in groups.items() if group and all(values[k] == values[name] for k in group)}
+    names = [name for name in values if name in shared or not (groups[name] or of_all_modes(name) in shared)]
+    ends = [name.rsplit(".", 1)[-1] for name in names]
+    return {name: end if ends.count(end) == 1 else name for name, end in zip(names, ends, strict=True)}
 
 
 @stages_of.register(Trajectory)

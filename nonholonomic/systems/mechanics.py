@@ -74,8 +74,8 @@ class AbstractMode(eqx.Module):
     ```
     """
 
-    #: Names of the components of the state, such as ("height", "velocity"), in tables and pictures; by default
-    #: "y[0]", "y[1]" and so on, as in your functions. One mode of a `Hybrid` is enough.
+    #: Names of the components of the state, such as ("height", "velocity"), in tables and pictures; by default "y0", "y1"
+    #: and so on. One mode of a `Hybrid` is enough.
     names: ClassVar[tuple[str, ...] | None] = None
 
     @abc.abstractmethod
@@ -152,7 +152,7 @@ class AbstractSystem(eqx.Module):
     """
 
     #: Names of the coordinates, such as ("x", "angle"), in tables and pictures, where their rates are "x_rate" and so on; by
-    #: default "q[0]" and "rate[0]" and so on, as in your functions. The number for a start is "start.x" or "start.q[0]".
+    #: default "q0" and "rate0" and so on.
     names: ClassVar[tuple[str, ...] | None] = None
 
     @property
@@ -250,7 +250,7 @@ class AbstractSystem(eqx.Module):
         ...     def reset(self, t, q, rate):
         ...         return q, self.impact(t, q, rate, self.restitution)
         >>> run = nonholonomic.simulate(Bead(), ([0.0], [1.0]), t1=4.0)
-        >>> for time, rate in zip(run.resets["time"], run.resets["rate[0]_after"]):
+        >>> for time, rate in zip(run.resets["time"], run.resets["rate0_after"]):
         ...     print(f"{time:.6f} s: {rate:.6f}")
         1.570796 s: 0.500000
         3.141593 s: 0.250000

@@ -72,10 +72,7 @@ class OwnModel(AbstractModel):
         hybrid, state = assembled(tree)
         form = Form.of(hybrid, state.size)[0]
         form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
-        parameters, names = Parameters.of(tree), names_of(tree["system"], state.size)
-        starts = (f"start.{name}" for name in names)
-        full_names = tuple(next(starts) if name.startswith("start") else name for name in parameters.names)
-        return cls(parameters=dataclasses.replace(parameters, names=full_names), form=form, names=names)
+        return cls(parameters=Parameters.of(tree), form=form, names=names_of(tree["system"], form.size))
 
     def __reduce__(self) -> tuple[Function, tuple[dict[str, Any]]]:
         # The structure of a tree with a user's classes cannot be pickled, but the tree can.
@@ -342,8 +339,8 @@ TAKEN = ("time", "status", "end_time", "steps", "rejected", "switches", "mode", 
 
 
 def names_of(system: Hybrid | AbstractSystem, size: int) -> tuple[str, ...]:
-    """The names of the components of a state: those of the system or of its first mode that has some, or `y[0]` and so on, or
-    `q[0]` and `rate[0]` and so on for a mechanical system, as in the arguments of its functions.
+    """The names of the components of a state: those of the system or of its first mode that has some, or `y0` and so on, or
+    `q0` and `rate0` and so on for a mechanical system.
 
     **Raises:** `ValueError` for a wrong number of names, names that are not different words, and names of other columns.
     """
@@ -351,11 +348,11 @@ def names_of(system: Hybrid | AbstractSystem, size: int) -> tuple[str, ...]:
     mechanical = next((mode for mode in modes if isinstance(mode, AbstractSystem)), None)
     owner = next((mode for mode in modes if mode.names is not None), mechanical)
     if owner is None:
-        return tuple(f"y[{k}]" for k in range(size))
+        return tuple(f"y{k}" for k in range(size))
     has_rates = isinstance(owner, AbstractSystem)
     size = owner.dimension if has_rates else size
     if (names := owner.names) is None:
-        return tuple(f"{name}[{k}]" for name in ("q", "rate") for k in range(size))
+        return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(size))
     if isinstance(names, tuple | list) and all(isinstance(name, str) and name.isidentifier() for name in names):
         words = (*names, *(f"{name}_rate" for name in names if has_rates))
         if len(names) == size and len(set(words)) == len(words) and set(words).isdisjoint(TAKEN):

@@ -8,7 +8,7 @@ import poincare
 import pytest
 import quadrature
 from close import assert_close
-from other_formulations import Multipliers, acceleration
+from other_formulations import Multipliers
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 from tops import homogeneous_ball, random_states, rutstam_top
@@ -81,7 +81,7 @@ def test_multipliers_give_the_same_accelerations():
 
         angles, rates = jax.jvp(chart, (state,), (rolling.field(state),))
         system = poincare.TopSystem(scene, rolling=True)
-        return rates[3:], acceleration(Multipliers(system), 0.0, *poincare.from_angles(angles))
+        return rates[3:], Multipliers(system).acceleration(0.0, *poincare.from_angles(angles))
 
     rates_of_rolling, reference = accelerations_of(states)
     size = jnp.max(jnp.abs(reference), axis=1, keepdims=True)

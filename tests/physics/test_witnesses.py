@@ -149,7 +149,7 @@ def test_the_general_formulations_give_the_accelerations_of_the_frictionless_top
         @eqx.filter_jit
         @eqx.filter_vmap
         def accelerations(scene, angles, kind=kind):
-            return other_formulations.acceleration(kind(poincare.TopSystem(scene)), 0.0, *poincare.from_angles(angles))
+            return kind(poincare.TopSystem(scene)).acceleration(0.0, *poincare.from_angles(angles))
 
         assert jnp.max(relative_error(accelerations(scenes, chart), expected, lengths)) < 1e-10
 
@@ -166,7 +166,7 @@ def test_the_general_reduction_by_a_cyclic_angle_gives_the_accelerations_of_the_
         q, rate = poincare.from_angles(angles)
         system = poincare.TopSystem(scene)
         reduced_system = other_formulations.Routhian(system, poincare.PSI, system.metric(q)[poincare.PSI] @ rate)
-        return other_formulations.acceleration(Hamel(reduced_system), 0.0, q[: poincare.PSI], rate[: poincare.PSI])
+        return Hamel(reduced_system).acceleration(0.0, q[: poincare.PSI], rate[: poincare.PSI])
 
     acceleration = accelerations(scenes, chart)
     # psi'' is not among the equations; it follows from the momentum.
@@ -200,9 +200,7 @@ def test_the_nonholonomic_formulations_give_the_accelerations_of_the_rolling_top
         @eqx.filter_jit
         @eqx.filter_vmap
         def accelerations(scene, angles, kind=kind):
-            return other_formulations.acceleration(
-                kind(poincare.TopSystem(scene, rolling=True)), 0.0, *poincare.from_angles(angles)
-            )
+            return kind(poincare.TopSystem(scene, rolling=True)).acceleration(0.0, *poincare.from_angles(angles))
 
         assert jnp.max(relative_error(accelerations(scenes, angles), rates[:, 3:], lengths)) < 1e-10
 

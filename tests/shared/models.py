@@ -86,9 +86,9 @@ CASES = {
         tippe.Scene(TOP, friction=tippe.Viscous(0.3)), tippe.Launch(0.2, 155.0), 1.0, loses_energy, "mu", 0.3, "theta"
     ),
     "stroller": Case(BOWL, RIDE, 2.5, lambda t, motion: motion.speed - 1.0, "rolling", 2.0, "speed"),
-    "modes": Case(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, lambda t, y: 0.3 - y[0], "restitution", 0.8, "y[0]"),
+    "modes": Case(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, lambda t, y: 0.3 - y[0], "restitution", 0.8, "y0"),
     "mechanics": Case(
-        Sleigh(), ([0.0, 0.0, 0.0], jnp.array([0.5, 0.0, 2.0])), 2.0, lambda t, y: 1.0 - y[2], "ahead", 0.3, "q[2]"
+        Sleigh(), ([0.0, 0.0, 0.0], jnp.array([0.5, 0.0, 2.0])), 2.0, lambda t, y: 1.0 - y[2], "ahead", 0.3, "q2"
     ),
 }
 

@@ -121,7 +121,7 @@ def test_samples_over_time_and_times_of_events_are_drawn_side_by_side():
     ends = nonholonomic.EventTimes([1.0], SEEN, ERROR, t1=3.0)
     fit = nonholonomic.identify(decay(2.0), [film, ends], {"rate": 2.0}, starts=2, progress=False)
     level, residuals, time, later_residuals, _ = fit.plot(unit="ms").axes
-    assert [axes.get_ylabel() for axes in (level, time)] == ["y[0]", "time [ms]"]
+    assert [axes.get_ylabel() for axes in (level, time)] == ["y0", "time [ms]"]
     moments, curve = level.lines[-1].get_data()
     assert_close(curve, np.exp(-fit.most_likely["rate"] * (moments + 0.1)), rtol=1e-6)
     assert residuals.lines[0].get_ydata().size == 10

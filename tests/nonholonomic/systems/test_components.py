@@ -167,6 +167,6 @@ def test_a_large_field_stands_once_in_a_program_and_its_motion_is_that_of_scipy(
 def test_a_fit_of_a_system_with_a_large_field_takes_differences():
     """A program with derivatives would take a minute to compile."""
     for system, size, expected in ((CarWithTrailer(), 5, OF_RECORDING), (Sleigh(), 3, None)):
-        data = Recording((np.zeros(size), np.zeros(size)), [1.0, 2.0], [0.0, 0.1], 0.01, "q[0]")
+        data = Recording((np.zeros(size), np.zeros(size)), [1.0, 2.0], [0.0, 0.1], 0.01, "q0")
         density = log_density(system, data, {"start.q[0]": 0.0})
         assert density.problem.step == expected

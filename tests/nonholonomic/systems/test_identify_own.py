@@ -18,17 +18,17 @@ def test_the_restitution_of_a_ball_from_its_heights():
     """Heights before and after two bounces, without noise, give back the restitution and the height of the drop."""
     times = np.array([0.2, 0.6, 0.9, 1.3, 1.5])
     heights = simulate(Hybrid([Ball(0.8)]), jnp.array([1.0, 0.0, 0.0]), 1.5, times=times).state[:, 0]
-    data = Recording([1.2, 0.0, 0.0], times, heights, 1e-3, "y[0]")
-    fit = identify(Hybrid([Ball(0.7)]), data, {"restitution": 0.75, "start.y[0]": 1.05}, progress=False)
+    data = Recording([1.2, 0.0, 0.0], times, heights, 1e-3, "y0")
+    fit = identify(Hybrid([Ball(0.7)]), data, {"restitution": 0.75, "start[0]": 1.05}, progress=False)
     assert_close(fit.estimates["system.modes[0].restitution"], 0.8, rtol=1e-6)
-    assert_close(fit.estimates["start.y[0]"], 1.0, rtol=1e-6)
+    assert_close(fit.estimates["start[0]"], 1.0, rtol=1e-6)
 
 
 def test_candidates_that_come_to_rest_without_a_mode_for_rest_are_counted_and_placed():
     """A ball rests after sqrt(2 h / g) (1 + e) / (1 - e), which is 2 s for a restitution of 0.632."""
     times = np.array([0.3, 0.7, 1.1, 1.5, 1.9, 2.0])
     heights = simulate(Hybrid([Ball(0.7)]), jnp.array([1.0, 0.0, 0.0]), 2.0, times=times).state[:, 0]
-    data = Recording([1.0, 0.0, 0.0], times, heights, 1e-3, "y[0]")
+    data = Recording([1.0, 0.0, 0.0], times, heights, 1e-3, "y0")
     fit = identify(Hybrid([Ball(0.7)]), data, {"restitution": Free(0.72, 0.3, 0.95)}, starts=4, progress=False)
     words = re.search(
         r"(\d+) of (\d+) candidates count as impossible.*restitution ([\d.]+) to ([\d.]+)$", *fit.verdict.notes
@@ -55,7 +55,7 @@ def test_times_in_milliseconds_and_numbers_that_do_not_act_are_seen_before_the_s
     """Samples of cos(w t), and the times at which it falls through 0, pi / (2 w)."""
     times = np.linspace(0.05, 1.5, 12)
     swing, free = Hybrid([Swing(3.1)]), {"frequency": 3.1, "idle": 1.0}
-    samples = Recording([1.0, 0.0], unit * times, np.cos(3.0 * times), 1e-2, "y[0]")
+    samples = Recording([1.0, 0.0], unit * times, np.cos(3.0 * times), 1e-2, "y0")
     events = EventTimes([1.0, 0.0], [unit * np.pi / 6.0], 1e-3 * unit, t1=unit, event=lambda t, y: y[0])
     if unit > 1.0:
         with pytest.raises(ValueError, match=r"times: .* are in seconds: did you mean 1e-3"):
@@ -76,9 +76,7 @@ def test_times_in_milliseconds_and_numbers_that_do_not_act_are_seen_before_the_s
 
 def test_a_quantity_that_the_system_does_not_have_is_named():
     data = Recording((np.zeros(3), np.zeros(3)), [1.0], [0.0], 1.0)
-    with pytest.raises(
-        ValueError, match=r"quantity: 'y\[0\]' \(the default\) must be one of q\[0\], q\[1\], q\[2\], rate\[0\]"
-    ):
+    with pytest.raises(ValueError, match=r"quantity: 'y0' \(the default\) must be one of q0, q1, q2, rate0"):
         identify(Sleigh(), data, {"ahead": 0.3})
 
 
@@ -96,6 +94,6 @@ def test_the_clock_of_a_recording_is_fitted_through_resets():
     """Samples between impacts, read off a clock that was 0.02 s ahead."""
     times = np.array([0.1, 0.2, 0.3, 0.6, 0.75, 0.9, 1.05])
     heights = simulate(Hybrid([Ball(0.8)]), jnp.array([1.0, 0.0, 0.0]), 1.5, times=times).state[:, 0]
-    data = Recording([1.0, 0.0, 0.0], times + 0.02, heights, 1e-3, "y[0]")
+    data = Recording([1.0, 0.0, 0.0], times + 0.02, heights, 1e-3, "y0")
     fit = identify(Hybrid([Ball(0.8)]), data, {"t0": 0.0, "restitution": 0.78}, starts=4, progress=False)
     assert abs(fit.estimates["t0"] - 0.02) < fit.standard_errors["t0"] < 1e-3

@@ -56,7 +56,7 @@ class Asymmetric(Skate):
 @pytest.mark.parametrize("inertia", [0.0, 0.2, -1.0], ids=["massless", "massive", "positive for allowed rates alone"])
 def test_a_metric_need_be_positive_only_for_the_allowed_rates(inertia):
     run = simulate(Skate(inertia=inertia), START, TIME, times=[1.0, TIME])
-    assert_close(run["rate[2]"], turn(inertia, np.array([1.0, TIME])), 1e-8)
+    assert_close(run["rate2"], turn(inertia, np.array([1.0, TIME])), 1e-8)
 
 
 ILLEGAL = {
@@ -113,7 +113,7 @@ def test_illegal_starts_in_a_batch_are_nan_and_illegal():
     def end(mass, sideways):
         start = (jnp.array(START[0]), jnp.array([0.0, 1.0, 0.0]) * sideways + jnp.array(START[1]))
         run = simulate(Skate(mass, 0.2), start, TIME, times=[0.0, TIME])
-        return run["rate[2]"][-1], run
+        return run["rate2"][-1], run
 
     columns = jnp.array([2.0, -2.0, 2.0]), jnp.array([0.0, 0.0, 1.0])
     (ends, runs), slopes = jax.jit(jax.vmap(jax.value_and_grad(end, has_aux=True)))(*columns)

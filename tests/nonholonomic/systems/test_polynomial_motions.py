@@ -75,6 +75,6 @@ def test_runs_whose_steps_end_within_round_off_of_a_margin(degree):
 @pytest.mark.slow
 def test_a_table_of_such_runs_has_all_its_times():
     heights = np.linspace(0.3, 2.0, 64)
-    table = sweep(system(2), [1.0, 0.0, 0.0, 0.0, 0.0], T1, axes={"start.y[0]": heights}, progress=False)
+    table = sweep(system(2), [1.0, 0.0, 0.0, 0.0, 0.0], T1, axes={"start[0]": heights}, progress=False)
     assert set(table.status) == {"event"}
     assert_close(table.time, [exact(2, height) for height in heights], rtol=1e-11)

@@ -60,7 +60,7 @@ def test_stick_and_slip_where_the_end_of_sticking_is_tangential():
     assert_close(run.state[1:, 0], 1.0 + 0.5 * np.sin(elapsed), atol=1e-9)
     assert_close(run.state[1:, 1], 0.5 * np.cos(elapsed), atol=1e-9)
     assert (run.resets["mode_before"].tolist(), run.resets["mode_after"].tolist()) == ([0], [1])
-    assert_close(run.resets["y[0]_after"], [1.0], atol=1e-9)
+    assert_close(run.resets["y0_after"], [1.0], atol=1e-9)
 
 
 class Melting(AbstractMode):
@@ -94,7 +94,7 @@ def test_a_printed_run_states_why_it_ended():
     run = simulate(Hybrid([Ball(0.2)]), jnp.array([1.0, 0.0, 0.0]), 5.0, times=jnp.array([0.2, 4.0]))
     lines = str(run).splitlines()
     assert lines[0].startswith("Trajectory of 2 times, unresolved at 0.67")
-    assert [line.split(":")[0].strip() for line in lines[1:6]] == ["y[0]", "y[1]", "y[2]", "resets", "steps"]
+    assert [line.split(":")[0].strip() for line in lines[1:6]] == ["y0", "y1", "y2", "resets", "steps"]
     assert lines[6].strip().startswith("resets followed one another without end; add a mode for rest")
     assert "without end" not in str(simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0]))
 
@@ -111,21 +111,21 @@ def test_a_printed_batch_states_how_its_runs_ended():
 def test_components_are_drawn_over_time():
     run = simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
     (panel,) = run.plot().axes
-    assert [text.get_text() for text in panel.get_legend().get_texts()] == ["y[0]", "y[1]", "y[2]"]
+    assert [text.get_text() for text in panel.get_legend().get_texts()] == ["y0", "y1", "y2"]
     assert run.plot(ax=panel) is panel
     # As in earlier versions, the axes may come without their name.
     assert run.plot(panel) is panel
-    heights, speeds = run.plot("y[0]", "y[1]", others=[run], unit="ms").axes
-    assert (heights.get_ylabel(), speeds.get_xlabel()) == ("y[0]", "time [ms]")
+    heights, speeds = run.plot("y0", "y1", others=[run], unit="ms").axes
+    assert (heights.get_ylabel(), speeds.get_xlabel()) == ("y0", "time [ms]")
     assert [text.get_text() for text in heights.get_legend().get_texts()] == ["run 1", "run 2"]
     higher = simulate(Hybrid([Ball()]), [2.0, 0.0, 0.0], 1.0, times=[0.0, 1.0])
-    labels = [text.get_text() for text in run.plot("y[0]", others=[higher]).axes[0].get_legend().get_texts()]
-    assert labels == ["start.y[0] 1", "start.y[0] 2"]
+    labels = [text.get_text() for text in run.plot("y0", others=[higher]).axes[0].get_legend().get_texts()]
+    assert labels == ["start[0] 1", "start[0] 2"]
     assert run.at(1.0).state.shape == (1, 3)
-    assert list(run) == ["y[0]", "y[1]", "y[2]"]
-    assert "y[3]" not in run
+    assert list(run) == ["y0", "y1", "y2"]
+    assert "y3" not in run
     assert_close(speeds.get_lines()[0].get_ydata()[[0, -1]], run.state[:, 1])
-    assert list(run.to_dataframe().columns) == ["time", "y[0]", "y[1]", "y[2]", "mode"]
+    assert list(run.to_dataframe().columns) == ["time", "y0", "y1", "y2", "mode"]
 
 
 def labels(*runs):
@@ -142,7 +142,7 @@ def test_labels_name_each_number_once_and_briefly():
     assert labels(both, run((0.8, 3.0), (0.8, 3.0))) == ["gravity 9", "gravity 3"]
     assert labels(both, run((0.8, 3.0), (0.8, 9.0))) == ["system.modes[0].gravity 9", "system.modes[0].gravity 3"]
     different = labels(both, run((0.8, 3.0), (0.8, 2.0), start=[2.0, 0.0, 0.0]))
-    assert different[1] == "start.y[0] 2, …"
+    assert different[1] == "start[0] 2, …"
     assert labels(run((0.8, 9.0)), run((0.8, 3.0))) == ["gravity 9", "gravity 3"]
 
 
@@ -154,10 +154,10 @@ def test_resets_are_listed_and_drawn():
     resets = run.resets
     assert_close(resets["time"], times, rtol=1e-9)
     assert resets["mode_before"].tolist() == resets["mode_after"].tolist() == [0, 0]
-    assert_close(resets["y[0]_before"], np.zeros(2), atol=1e-9)
-    assert_close(resets["y[1]_before"], -speeds[:2], rtol=1e-9)
-    assert_close(resets["y[1]_after"], speeds[1:], rtol=1e-9)
-    (velocity,) = run.plot("y[1]").axes[0].get_lines()
+    assert_close(resets["y0_before"], np.zeros(2), atol=1e-9)
+    assert_close(resets["y1_before"], -speeds[:2], rtol=1e-9)
+    assert_close(resets["y1_after"], speeds[1:], rtol=1e-9)
+    (velocity,) = run.plot("y1").axes[0].get_lines()
     assert_close(velocity.get_xdata(), np.repeat([0.0, times[0], 1.0, times[1], 1.5], [1, 2, 1, 2, 1]), rtol=1e-9)
     assert_close(velocity.get_ydata()[[1, 2, 4, 5]], [-speeds[0], speeds[1], -speeds[1], speeds[2]], rtol=1e-9)
     heights = [run.plot().axes[0].get_lines()[0].get_ydata(), run.portrait().axes[0].get_lines()[0].get_xdata()]
@@ -165,7 +165,7 @@ def test_resets_are_listed_and_drawn():
     for drawn in heights:
         assert len(drawn) == 7
         assert_close(np.sort(drawn)[:4], np.zeros(4), atol=1e-9)
-    assert len(run.to_table()["y[0]"]) == 3
+    assert len(run.to_table()["y0"]) == 3
 
 
 def test_resets_need_one_run():
@@ -289,23 +289,21 @@ def test_the_sleigh_turns_to_its_final_heading():
 def test_a_trajectory_is_a_table():
     run = simulate(Hybrid([Melting()]), jnp.array([1.0]), 0.5, times=jnp.array([0.25, 0.5]))
     table = run.to_table()
-    assert_close(table["y[0]"], [0.75, 0.5], rtol=1e-12)
+    assert_close(table.y0, [0.75, 0.5], rtol=1e-12)
     assert table.attributes["status"] == "completed"
-    assert run.to_xarray()["y[0]"].dims == ("time",)
+    assert run.to_xarray()["y0"].dims == ("time",)
     request = json.loads(table.attributes["request"])
-    assert (request["system"], request["start.y[0]"], request["end_time"]) == ("Hybrid", 1.0, 0.5)
+    assert (request["system"], request["start[0]"], request["end_time"]) == ("Hybrid", 1.0, 0.5)
 
 
 def test_the_file_of_a_run_is_not_overwritten_by_a_table(tmp_path):
     run = simulate(Hybrid([Melting()]), jnp.array([1.0]), 0.5, times=jnp.array([0.25, 0.5]))
     run.save(tmp_path / "run.h5")
-    assert_close(Table.load(tmp_path / "run.h5")["y[0]"], run["y[0]"])
+    assert_close(Table.load(tmp_path / "run.h5").y0, run["y0"])
     with pytest.raises(
         ValueError, match=r"run.h5 holds the result of another run: it is a single run, not a table of many"
     ):
-        sweep(
-            Hybrid([Melting()]), [1.0], 0.5, axes={"start.y[0]": [1.0, 2.0]}, path=tmp_path / "run.h5", progress=False
-        )
+        sweep(Hybrid([Melting()]), [1.0], 0.5, axes={"start[0]": [1.0, 2.0]}, path=tmp_path / "run.h5", progress=False)
 
 
 def test_a_lagrangian_of_one_s_own_is_run_by_poincare_s_equations():
@@ -356,7 +354,7 @@ def test_components_have_the_names_of_the_system():
     run = simulate(Hybrid([NamedBall()]), [1.0, 0.0, 0.0], 2.0, times=TIMES)
     assert list(run.to_table().variables) == ["height", "velocity", "bounces", "mode"]
     assert_close(run["height"], run.state[:, 0])
-    table = sweep(Hybrid([NamedBall()]), [1.0, 0.0, 0.0], 0.3, axes={"start.height": [1.0, 2.0]}, progress=False)
+    table = sweep(Hybrid([NamedBall()]), [1.0, 0.0, 0.0], 0.3, axes={"start[0]": [1.0, 2.0]}, progress=False)
     assert_close(table.height, np.array([1.0, 2.0]) - 0.5 * GRAVITY * 0.09, rtol=1e-12)
     turning = simulate(NamedSleigh(), ([0.0, 0.0, 0.0], [1.0, 0.0, 1.3]), 0.5, times=[0.5])
     assert list(turning.names) == ["x", "y", "heading", "x_rate", "y_rate", "heading_rate"]
@@ -367,6 +365,12 @@ def test_wrong_names_are_refused(words):
     wrong = type("Wrong", (Ball,), {"names": words})
     with pytest.raises(ValueError, match=r"Wrong\.names = .* must be 3 different words, one for each component"):
         simulate(Hybrid([wrong()]), [1.0, 0.0, 0.0], 2.0)
+
+
+def test_rates_must_not_be_named_like_coordinates():
+    wrong = type("Wrong", (Sleigh,), {"names": ("x", "x_rate", "heading")})
+    with pytest.raises(ValueError, match="must be 3 different words, one for each coordinate"):
+        simulate(wrong(), ([0.0, 0.0, 0.0], [1.0, 0.0, 1.3]), 0.5)
 
 
 @pytest.mark.parametrize(
@@ -461,8 +465,8 @@ def test_a_sample_at_a_reset_is_the_state_before_it():
     gradient = jax.jit(jax.grad(lambda decays: jnp.sum(jax.vmap(levels)(decays) * DOSE_TIMES)))(decays)
     assert_close(gradient[0], np.full(7, slope @ DOSE_TIMES), rtol=1e-6)
     axes = {"modes[0].decay[0]": [0.7, 0.8]}
-    table = sweep(Hybrid([Doses()]), [1.0, 0.0], 20.0, axes=axes, times=DOSE_TIMES, quantities=["y[0]"], progress=False)
-    assert_close(table["y[0]"][0], expected, rtol=1e-9)
+    table = sweep(Hybrid([Doses()]), [1.0, 0.0], 20.0, axes=axes, times=DOSE_TIMES, quantities=["y0"], progress=False)
+    assert_close(table["y0"][0], expected, rtol=1e-9)
 
 
 def test_samples_at_the_times_of_all_resets():
@@ -481,11 +485,11 @@ def test_a_recording_says_on_which_side_of_a_reset_its_samples_are(side):
     """The levels of 1 s, 2 s, ... just before or just after the doses, fitted from another start."""
     times = np.arange(1.0, 8.0)
     values = level(times, 0.7, side == "after")
-    recording = nonholonomic.Recording([1.0, 0.0], times, values, 0.001, "y[0]", side=side)
+    recording = nonholonomic.Recording([1.0, 0.0], times, values, 0.001, "y0", side=side)
     fit = nonholonomic.identify(Hybrid([Doses()]), recording, {"decay[0]": 0.6}, progress=False)
     assert_close(fit.estimates["system.modes[0].decay[0]"], 0.7, atol=1e-5)
     with pytest.raises(ValueError, match=r"side = 'below' must be \"before\" or \"after\""):
-        nonholonomic.Recording([1.0, 0.0], times, values, 0.001, "y[0]", side="below")
+        nonholonomic.Recording([1.0, 0.0], times, values, 0.001, "y0", side="below")
 
 
 class EulerTop(AbstractSystem):
