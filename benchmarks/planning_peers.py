@@ -17,7 +17,7 @@ from ompl import base, control, util
 
 import stroller
 from stroller.planning.problem import Problem, separation
-from stroller.planning.search import SMOOTHING, Path, smoothed, timed
+from stroller.planning.search import Path, timed
 from stroller.planning.transcription import LIMIT_RESERVE
 
 #: Intervals of the collocation, Radau points in each, and discs that cover the footprint.
@@ -90,9 +90,8 @@ def straight_guess(problem: Problem, times: np.ndarray) -> np.ndarray:
 def path_guess(problem: Problem, path: Path, times: np.ndarray) -> np.ndarray:
     """States on a path of our search, (6, times)."""
     wheelbase, even = float(problem.scene.body.wheelbase), np.linspace(0.0, times[-1], INTERVALS + 1)
-    points, speed, curvature = timed(path, INTERVALS + 1, float(times[-1]), wheelbase)
-    angle = smoothed(np.arctan(wheelbase * curvature), SMOOTHING[0])
-    rows = [*points.T, angle, smoothed(speed, SMOOTHING[1]) / np.cos(angle), np.gradient(angle, even)]
+    points, splines = timed(path, INTERVALS + 1, float(times[-1]), wheelbase)
+    rows = [*points.T, *splines.T, np.gradient(splines[:, 0], even)]
     return np.stack([np.interp(times, even, row) for row in rows])
 
 

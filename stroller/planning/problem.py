@@ -70,7 +70,8 @@ as_size = functools.partial(as_place, name="size", counts=(2,), single=True)
 
 class Box(Bounded):
     """A rectangular obstacle, seen from above where the ground's coordinates are x and y. On any other ground, it stands on the
-    tangent plane at its centre, and reaches as far above and below this plane as its corners are from the centre.
+    tangent plane at its centre, and reaches as far above and below this plane as its corners are from the centre; distances are
+    measured in this plane or along its normal, whichever is greater.
 
     **Arguments:**
 
@@ -113,7 +114,7 @@ class Box(Bounded):
 
 class Disc(Bounded):
     """A round obstacle, seen from above where the ground's coordinates are x and y. On any other ground, it stands on the
-    tangent plane at its centre, and reaches a radius above and below this plane.
+    tangent plane at its centre, and reaches a radius above and below this plane; distances are those of a `Box`.
 
     **Arguments:**
 

@@ -413,23 +413,17 @@ def guess_of(problem: Problem, path: Path) -> tuple[Float[np.ndarray, "rows unkn
         accelerations = [most.get("force", np.inf) / body.mass, most.get("grip", np.inf) * scene.gravity]
         slowest = [way / accelerations[0], way / accelerations[1], body.steering_inertia / most.get("torque", np.inf)]
         t1 = max(way / most.get("speed", np.inf), 2.0 * float(np.sqrt(max(slowest))))
-    points, speed, curvature = timed(path, INTERVALS + 1, t1, wheelbase)
-    steering, speed = (
-        # A running mean.
-        np.convolve(np.pad(values, width, mode="edge"), np.full(2 * width + 1, 1.0 / (2 * width + 1)), mode="valid")
-        for values, width in zip((np.arctan(wheelbase * curvature), speed), SMOOTHING, strict=True)
-    )
-    front_speed = speed / np.cos(steering)
+    points, splines = timed(path, INTERVALS + 1, t1, wheelbase)
     poses = np.asarray(poses_at(scene.surface, problem.tangent, points))
     poses = np.concatenate([poses, poses[-1:], poses[-1:]])
-    splines = np.pad(np.stack([steering, front_speed], axis=1), ((1, ORDER - 3), (0, 0)), mode="edge")
-    return np.concatenate([poses, splines], axis=1), t1
+    return np.concatenate([poses, np.pad(splines, ((1, ORDER - 3), (0, 0)), mode="edge")], axis=1), t1
 
 
 def timed(
     path: Path, knots: int, t1: float, wheelbase: float
-) -> tuple[Float[np.ndarray, "knots 3"], Float[np.ndarray, " knots"], Float[np.ndarray, " knots"]]:
-    """Poses, speeds of the rear axle [m/s] and curvatures [1/m] at evenly spaced times from 0 to `t1`."""
+) -> tuple[Float[np.ndarray, "knots 3"], Float[np.ndarray, "knots 2"]]:
+    """Poses, and running means of the steering angle [rad] and the speed of the front wheel [m/s], at evenly spaced times from
+    0 to `t1`."""
     # The sections between changes of direction.
     cuts = [0, *(np.flatnonzero(np.diff(path.direction)) + 1), len(path.direction)]
     lengths = np.array([path.length[a:b].sum() for a, b in zip(cuts, cuts[1:], strict=False)])
@@ -449,5 +443,9 @@ def timed(
     piece = np.clip(np.searchsorted(piece_ends, along), 0, len(piece_ends) - 1)
     into = along - (piece_ends - path.length)[piece]
     poses = driven(path.poses[piece], path.direction[piece], path.curvature[piece], into)
-    speed = rate * lengths[section] / (shares[section] * t1)
-    return poses, speed * path.direction[piece], path.curvature[piece]
+    speed = rate * lengths[section] / (shares[section] * t1) * path.direction[piece]
+    steering, speed = (
+        np.convolve(np.pad(values, width, mode="edge"), np.full(2 * width + 1, 1.0 / (2 * width + 1)), mode="valid")
+        for values, width in zip((np.arctan(wheelbase * path.curvature[piece]), speed), SMOOTHING, strict=True)
+    )
+    return poses, np.stack([steering, speed / np.cos(steering)], axis=1)
