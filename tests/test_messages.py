@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from never_run import LAUNCH, PRAM, RIDE, TOP, batch, followed, run_of_nothing, small_table
+from never_run import LAUNCH, PRAM, RIDE, TOP, batch, followed, rides, run_of_nothing, small_table
 from tops import rutstam_top
 
 import nonholonomic
@@ -196,6 +196,10 @@ REFUSED = {
     "a plot beside a number": (
         lambda: run_of_nothing().plot([0.3]),
         "others[0] = 0.3 must be a run of the same package",
+    ),
+    "a picture of a run of the other package": (
+        lambda: run_of_nothing().plot(others=[rides()]),
+        "others[0] = 2 runs of 51 times must be a run of the same package",
     ),
     "a page that is no page": (lambda: run_of_nothing().view("x.txt"), "path = 'x.txt' must end in .html or .htm"),
     "a page without a path": (lambda: run_of_nothing().view(3), "path = 3 must be the path of a file"),

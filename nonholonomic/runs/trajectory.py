@@ -22,7 +22,7 @@ from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, likely, readable_unit, require_unit, shown
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
-from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure
+from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure, stages_of
 from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
 from ..views.stage import curves_in
 from .model import AbstractModel, Names, Sliders, model_of, run_of
@@ -254,6 +254,9 @@ def live_run(
 #: Half the side of the drawn plane [m], and the radius of the point and the width of its trace, in the same unit.
 HALF, RADIUS, WIDTH = 1.0, 0.03, 0.012
 
+#: The drawn components of a state: the first and the last.
+DRAWN_COMPONENTS = np.array([0, -1])
+
 #: Number of lines of the plane's grid in each direction.
 LINES = 9
 
@@ -270,17 +273,12 @@ def portraits(
     groups = [list(enumerate(runs))] if overlaid else [[numbered] for numbered in enumerate(runs)]
     stages = []
     for group in groups:
-        points = np.concatenate([plane_points(run) for _, run in group])
+        points = np.concatenate([np.asarray(run.state)[:, DRAWN_COMPONENTS] for _, run in group])
         centre, scale = frame_of(points) if drawn is None else drawn
         shows = tuple(show(run, number, centre, scale) for number, run in group)
         names = group[0][1].portrait_axes
         stages.append(Stage(f"{names[1]} over {names[0]}", plane(scale), shows))
     return stages
-
-
-def plane_points(run: "Trajectory") -> Float[np.ndarray, "times 2"]:
-    """The drawn components of a run."""
-    return np.stack([np.asarray(run[name], float) for name in run.portrait_axes], axis=-1)
 
 
 def frame_of(points: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, np.ndarray]:
@@ -291,21 +289,31 @@ def frame_of(points: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, np.ndar
     return 0.5 * (low + high), 1.8 * HALF / span
 
 
+def drawn_point(
+    xp: Any, states: Float[Array | np.ndarray, "*times components"], centre: np.ndarray, scale: np.ndarray, rate: float
+) -> Frame:
+    """The drawn quantities of some states. **Arguments:** `xp`: `numpy` or `jax.numpy`; `rate`: turning rate [rad/s]."""
+    one = xp.ones_like(states[..., :1])
+    position = xp.concatenate([(states[..., DRAWN_COMPONENTS] - centre) * scale, RADIUS * one], axis=-1)
+    upright, normal = one * np.array([0.0, 0.0, 0.0, 1.0]), one * np.array([0.0, 0.0, 1.0])
+    curves = tuple(xp.moveaxis(states, -1, 0))
+    return Frame(normal, ((position, upright),), ((position, None),), (), curves, rate * one[..., 0])
+
+
 def show(run: "Trajectory", number: int, centre: np.ndarray, scale: np.ndarray) -> Show:
     """The drawing of one run, the `number`-th of all."""
     colour = COLOURS[number % len(COLOURS)]
-    is_reached = np.all(np.isfinite(np.asarray(run.state)), axis=-1)
-    points = ((plane_points(run) - centre) * scale)[is_reached]
-    position = np.concatenate([points, np.full((len(points), 1), RADIUS)], axis=-1)
+    states = np.asarray(run.state)
+    is_reached = np.all(np.isfinite(states), axis=-1)
+    frames = drawn_point(np, states[is_reached], centre, scale, 0.0)
+    ((position, upright),) = frames.bodies
     # An octahedron stands for the point.
     vertices = RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
     corners = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
-    upright, ball = np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1)), Mesh(vertices, np.array(corners), colour)
-    curves = tuple(Curve(name, np.asarray(run[name])[is_reached]) for name in run.names)
+    body = Body("state", position, upright, (Mesh(vertices, np.array(corners), colour),))
     trace = Trace(" over ".join(run.portrait_axes[::-1]), position, colour, WIDTH)
-    normal = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    body = Body("state", position, upright, (ball,))
-    return Show(f"run {number + 1}", colour, np.asarray(run.t)[is_reached], normal, HALF, (body,), (trace,), (), curves)
+    times, curves = np.asarray(run.t)[is_reached], tuple(map(Curve, run.names, frames.curves))
+    return Show(f"run {number + 1}", colour, times, frames.normal, HALF, (body,), (trace,), (), curves)
 
 
 def plane(scale: np.ndarray) -> Arena:
@@ -357,9 +365,6 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
     def to_table(self) -> Table:
         return self.table_of(())
 
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Unit = None) -> list[Stage]:
-        return stages_of(self, [self, *others], overlaid, unit)
-
     @status_line("reading off")
     def __str__(self) -> str:
         # A batch, or a run inside a transformation, has no single values to show.
@@ -371,15 +376,6 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
             counts = Counter(Status(int(code)).word for code in codes)
             return ": ".join(filter(None, [runs, ", ".join(f"{count} {word}" for word, count in counts.items())]))
         return self.in_words()
-
-
-@functools.singledispatch
-def stages_of(run: AbstractRun, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
-    """The stages on which runs of one kind are drawn: one for each, or a common one for overlaid runs.
-
-    Each kind of run registers its own function. **Arguments:** `run`: the first of the `runs`; `unit`: as for `plot`.
-    """
-    raise NotImplementedError(f"{type(run).__name__} has no picture")
 
 
 class Trajectory(AbstractRun):

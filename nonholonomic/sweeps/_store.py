@@ -556,8 +556,8 @@ def saved_cells(path: Path) -> int:
 
 
 def contents_of(path: Path) -> tuple[Layout, Mapping[str, Values]]:
-    """The layout of a table, and its variables with all cells along the first axis, or the `Stored` variables of a large
-    table. Of an unfinished table, these are the chunks that are on disk.
+    """The layout of a table, and its variables, which stay in the file if the table is large. Of an unfinished table, these
+    are the chunks that are on disk.
 
     **Raises:** `OSError` that names the path if it cannot be read, holds no table, or has a damaged chunk.
     """
@@ -568,7 +568,7 @@ def contents_of(path: Path) -> tuple[Layout, Mapping[str, Values]]:
         layout = stored.layout
         if not is_unfinished and layout.bytes_of_cells(layout.cells) > MAX_BYTES_IN_MEMORY:
             return layout, stored
-        return layout, {name: stored.whole(name) for name in layout.kinds}
+        return layout, dict(stored)
     except OSError:
         # The table may have been finished in the meantime.
         if is_unfinished and path.exists():

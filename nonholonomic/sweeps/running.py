@@ -271,7 +271,7 @@ def sweep(
                 for number, values in chunks:
                     for name, of_variable in of_all_cells.items():
                         of_variable[slice(*layout.ends(number))] = values[name]
-                return Table.laid_out(layout, of_all_cells)
+                return Table.laid_out(layout, {name: layout.shaped(name, part) for name, part in of_all_cells.items()})
     except KeyboardInterrupt:
         none_saved = f"interrupted; without path=, none of {with_spaces(layout.cells)} cells is saved"
         raise KeyboardInterrupt(none_saved if store is None else store.interrupted()) from None

@@ -230,12 +230,10 @@ class Table(eqx.Module):
         return cls.laid_out(*contents_of(as_path(path, "path")))
 
     @classmethod
-    def laid_out(cls, layout: Layout, values: Mapping[str, Values]) -> "Table":
-        """A table from arrays with all cells along the first axis and codes instead of words, or from its file."""
-        if not isinstance(values, Stored):
-            values = {name: layout.shaped(name, of_cells) for name, of_cells in values.items()}
+    def laid_out(cls, layout: Layout, variables: Mapping[str, Tabulated]) -> "Table":
+        """A table with a layout."""
         fields = layout.units, layout.attributes, layout.words, layout.inner, layout.long_names
-        return cls(layout.coords, values, *fields)
+        return cls(layout.coords, variables, *fields)
 
     def digits(self, variable: str = "time") -> Values:
         """A variable with its correct digits: "5.01142(3)" is 5.01142 with an error of 0.00003.
@@ -583,7 +581,7 @@ class Tabular(abc.ABC):
                 quantities, ax = (), first
             else:
                 quantities, others = (), first
-        runs, unit = [self, *require_others(self, others, "to_table")], unit or self.unit
+        runs, unit = [self, *require_others(self, others)], unit or self.unit
         labels = self.labels_of(runs, unit) if label is None else [label] if isinstance(label, str) else label
         if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
             raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")

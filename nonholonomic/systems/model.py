@@ -22,12 +22,12 @@ from ..runs.event import UNMEASURED
 from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import (
-    RADIUS,
+    DRAWN_COMPONENTS,
     TOLERANCE,
+    drawn_point,
     frame_of,
     live_run,
     page_of,
-    plane_points,
     portraits,
     runs_at_ends,
     sliders_of,
@@ -381,7 +381,7 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
         ranges = {name: tuple(sorted((0.5 * value, 2.0 * value))) for name, value in values.items()}
     sliders = sliders_of(model, ranges)
     runs, names = runs_at_ends(model, sliders, t1), model.names
-    centre, scale = frame_of(np.concatenate([plane_points(run) for run in runs]))
+    centre, scale = frame_of(np.concatenate([np.asarray(run.state)[:, DRAWN_COMPONENTS] for run in runs]))
     (stage,) = portraits(runs[:1], False, (centre, scale))
 
     def outcome(model: OwnModel, ended: HybridOutcome) -> tuple[Array, Array]:
@@ -393,12 +393,7 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
         return model.ended(ended, TOLERANCE)[0], result[0]
 
     def frame(model: OwnModel, time: object, rows: Array, mode: object) -> Frame:
-        components = model.components_of(rows[:, 0])
-        point = (components[jnp.array([0, len(names) - 1])] - centre) * scale
-        position = jnp.concatenate([point, jnp.full(1, RADIUS)])
-        upright, normal = jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([0.0, 0.0, 1.0])
-        rate = jnp.asarray(2.0 * np.pi * TURNS / t1) + 0.0 * point[0]
-        return Frame(normal, ((position, upright),), ((position, None),), (), tuple(components), rate)
+        return drawn_point(jnp, model.components_of(rows[:, 0]), centre, scale, 2.0 * np.pi * TURNS / t1)
 
     live = live_run(
         model,

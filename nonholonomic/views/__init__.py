@@ -11,6 +11,7 @@ from .pages import page_of_job as page_of_job
 from .pages import picture_as_html as picture_as_html
 from .pages import require_others as require_others
 from .pages import run_job as run_job
+from .pages import stages_of as stages_of
 from .pages import table_as_html as table_as_html
 from .pages import without_motion as without_motion
 from .plot import draw_fit as draw_fit

@@ -5,8 +5,8 @@ curves, `film.js` saves pictures and films, and `player.js` unpacks the data and
 jupyter-threejs-sage.
 """
 
-import abc
 import base64
+import functools
 import html
 import json
 import os
@@ -334,16 +334,25 @@ views.ready.then((player) => player.film([REQUEST], (share) => { post("share", S
 """
 
 
-class Viewable(abc.ABC):
+@functools.singledispatch
+def stages_of(run: Any, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
+    """The stages on which runs of one kind are drawn: one for each, or a common one for overlaid runs.
+
+    Each kind of run registers its own function. **Arguments:** `run`: the first of the `runs`; `unit`: unit of the numbers
+    in their names, as for `plot`.
+    """
+    raise NotImplementedError(f"{type(run).__name__} has no picture")
+
+
+class Viewable:
     """A run that can be drawn, alone or with others."""
 
     #: The units in which pictures, pages and texts show the numbers of the run, unless others are asked for.
     unit: ClassVar[Unit] = None
 
-    @abc.abstractmethod
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Unit = None) -> list[Stage]:
-        """This run and others as stages: each on its own stage, or all on that of the first. **Arguments:** `unit`: unit of
-        the numbers in their names, as for `plot`."""
+        """This run and others as stages; arguments as for `stages_of`."""
+        return stages_of(self, [self, *others], overlaid, unit)
 
     @status_line("drawing")
     def view(
@@ -445,17 +454,17 @@ class Viewable(abc.ABC):
         """The stages in a unit, after a check of the unit and that the others are runs of the same package."""
         require_unit(unit)
         unit = unit or self.unit
-        return curves_in(self.stages(require_others(self, others, "stages"), overlaid, unit), unit)
+        return curves_in(self.stages(require_others(self, others), overlaid, unit), unit)
 
 
-def require_others(run: object, others: Any, method: str) -> Sequence[Any]:
-    """Raise `ValueError` unless the others are a list of runs that share a method with the run; return them."""
+def require_others(run: object, others: Any) -> Sequence[Any]:
+    """Raise `ValueError` unless the others are a list of runs that are drawn as the run is; return them."""
     if isinstance(others, type(run)):
         raise ValueError("others = a run must be a list of runs: write others=[run]")
     if not isinstance(others, list | tuple):
         raise ValueError(f"others = {shown(others)} must be a list of runs, such as [run]")
     for k, other in enumerate(others):
-        if getattr(type(other), method, None) is not getattr(type(run), method):
+        if stages_of.dispatch(type(other)) is not stages_of.dispatch(type(run)):
             raise ValueError(f"others[{k}] = {shown(other)} must be a run of the same package, as simulate returns it")
     return others
 

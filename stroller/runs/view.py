@@ -16,15 +16,7 @@ from nonholonomic.integration import AbstractPassive, ExtendedProblem
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import numbers
 from nonholonomic.runs.model import Sliders
-from nonholonomic.runs.trajectory import (
-    TOLERANCE,
-    explore_model,
-    live_run,
-    page_of,
-    runs_at_ends,
-    sliders_of,
-    stages_of,
-)
+from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, page_of, runs_at_ends, sliders_of
 from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
@@ -73,7 +65,7 @@ CURVES = {"speed": "speed [m/s]", "steering": "steering angle [rad]", "energy": 
 CURVES |= {"normal_force": "normal force [N]"}
 
 
-@stages_of.register(Trajectory)
+@views.stages_of.register(Trajectory)
 def _(run: Trajectory, runs: list[Trajectory], overlaid: bool, unit: Unit) -> list[views.Stage]:
     numbered = list(enumerate(runs))
     return grouped([numbered] if overlaid else [[ride] for ride in numbered], names_of(runs, unit))

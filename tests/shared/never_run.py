@@ -21,6 +21,13 @@ def batch(*shape):
     return eqx.tree_at(lambda run: run.t, run_of_nothing(), jnp.zeros(shape))
 
 
+def rides():
+    """A batch of rides of a stroller that has times alone."""
+    batch = object.__new__(stroller.Trajectory)
+    object.__setattr__(batch, "t", jnp.zeros((2, 51)))
+    return batch
+
+
 def followed():
     """A run with a dense output, which is never asked."""
     return dataclasses.replace(run_of_nothing(), dense=object())

@@ -20,15 +20,7 @@ from nonholonomic.parameters import numbers, numbers_of, with_numbers
 from nonholonomic.runs.event import Ensemble
 from nonholonomic.runs.model import Sliders
 from nonholonomic.runs.table import at_the_end
-from nonholonomic.runs.trajectory import (
-    TOLERANCE,
-    explore_model,
-    live_run,
-    page_of,
-    runs_at_ends,
-    sliders_of,
-    stages_of,
-)
+from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, page_of, runs_at_ends, sliders_of
 from nonholonomic.sweeps import chunk_for
 from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit, readable_unit
@@ -149,7 +141,7 @@ def show(scene: Scene, times: np.ndarray, frames: Frame[np.ndarray], number: int
     )
 
 
-@stages_of.register(AbstractTrajectory)
+@views.stages_of.register(AbstractTrajectory)
 def _(run: AbstractTrajectory, runs: list[AbstractTrajectory], overlaid: bool, unit: Unit) -> list[views.Stage]:
     drawn = [(name, run.scene, *motion(run)) for name, run in zip(names_of(runs, unit), runs, strict=True)]
     return stages([drawn] if overlaid else [[one] for one in drawn])

@@ -25,7 +25,7 @@ def child(path: Path, log: Path) -> int:
 
                 def note(block):
                     stream.write(f"{block}\n")
-                    time.sleep(0.004)
+                    time.sleep(0.02)
 
                 cheap_sweep(path, note)
             os._exit(0)
