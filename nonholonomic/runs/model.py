@@ -250,10 +250,11 @@ def model_of(
     >>> from nonholonomic.runs import model_of
     >>> model_of(3.0, [1.0])
     Traceback (most recent call last):
-    ValueError: system = 3.0 must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem
+    ValueError: system = 3.0 must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem; wrap ...
     """
     raise ValueError(
-        f"system = {shown(system)} must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem"
+        f"system = {shown(system)} must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem; wrap "
+        "modes in nonholonomic.Hybrid([...])"
     )
 
 

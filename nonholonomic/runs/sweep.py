@@ -314,7 +314,15 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
     if len(illegal):
         first, of_all = (illegal[0], listed) if listed is not None else (0, columns(grid, int(illegal[0]), 1))
         values = {name: float(values[first]) for name, values in of_all.items()}
-        _warn_of_illegal_cells(job.model, values, len(illegal), cells)
+        reason = ""
+        try:
+            job.model.replaced(values).check()
+        except ValueError as error:
+            named = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
+            reason = f"; {'the first is at ' * bool(named)}{named}: {error}"
+        warn(
+            f"{len(illegal)} of {cells} cells are illegal: their results are NaN, and their status is 'illegal'{reason}"
+        )
     # The coordinates of scenes are regular.
     if "steps" in table and not is_scene:
         steps = np.ravel(table["steps"])
@@ -325,14 +333,3 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
                 "simulate one of them; it warns if its coordinates are singular, like Euler angles at their pole"
             )
     return table
-
-
-def _warn_of_illegal_cells(model: AbstractModel, first: dict[str, float], count: int, cells: int) -> None:
-    """Warn of the cells of a table that may not run. **Arguments:** `first`: the parameters of the first of them."""
-    reason = ""
-    try:
-        model.replaced(first).check()
-    except ValueError as error:
-        named = ", ".join(f"{name} = {value:.6g}" for name, value in first.items())
-        reason = f"; {'the first is at ' * bool(named)}{named}: {error}"
-    warn(f"{count} of {cells} cells are illegal: their results are NaN, and their status is 'illegal'{reason}")

@@ -5,26 +5,29 @@ import dataclasses
 import functools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from .. import views
+from ..compilation.tracing import named_errors
 from ..hybrid import MOST_ROUNDS, hybrid_resets
 from ..integration import AbstractProblem, Settings
 from ..integration.problem import Status, run_bounds
 from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
-from ..text import Unit, as_text, distinguishing_labels, likely, readable_unit, require_unit, shown
+from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
-from ..views import COLOURS, PALE, Arena, Body, Curve, Mesh, Page, Show, Stage, Trace, Viewable, new_figure, stages_of
+from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Stage, Viewable, stages_of
 from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
-from ..views.stage import curves_in
+from ..views.stage import AbstractPart, Draw, curves_in, meshes_of, of_grid
 from .model import AbstractModel, Names, Sliders, model_of, run_of
 
 # A page with sliders that simulates any model in the browser.
@@ -49,13 +52,14 @@ def explore(
     input: object = None,
     unit: Unit = None,
     jumps: object = None,
+    draw: Draw = None,
 ) -> Page:
     """Make a page with sliders that simulates a run in the browser while you move a slider.
 
     The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the
     Runge-Kutta pair and the step-size control are generated from those of tables, at a tolerance of 1e-7. A scene shows
-    its body; your own system shows the first and the last component of its state as a point in a plane, and the curves of
-    all components.
+    its body; your own system shows the first two components of its state as a point in a plane, or what `draw` returns, and
+    the curves of all components.
 
     **Arguments:**
 
@@ -65,6 +69,7 @@ def explore(
       matches.
     - `t1`: horizon [s].
     - `unit`: unit of the curves, such as "deg" for all angles, or several, such as ("deg", "cm").
+    - `draw`: for your own system, as for `Trajectory.view`; a slider moves the parts, but cannot change their size.
 
     **Returns:** a `Page`, with its `html`.
 
@@ -94,7 +99,18 @@ def explore(
 
     ```
     """
-    return explore_model(model_of(system, start, None, input, jumps), path, sliders, float(t1), unit)
+    return explore_model(drawn_by(model_of(system, start, None, input, jumps), draw), path, sliders, float(t1), unit)
+
+
+def drawn_by(model: AbstractModel, draw: Draw) -> AbstractModel:
+    """The model of your own system with a drawing; raises `ValueError` for another model."""
+    if draw is None:
+        return model
+    if not callable(draw) or "draw" not in (field.name for field in dataclasses.fields(model)):
+        raise ValueError(
+            f"draw = {shown(draw)} must be a function draw(system, t, y) for your own system, and None for a scene"
+        )
+    return dataclasses.replace(model, **{"draw": draw})
 
 
 def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: float, unit: Unit) -> Page:
@@ -177,7 +193,7 @@ def sliders_of(model: AbstractModel, ranges: Any, drawn: tuple[str, ...] = ()) -
             )
         for end in (low, high):
             model.require_values({path: end})
-        sliders.append(Slider(name, path, (label or short).replace("_", " "), readable_unit(unit), low, high, value))
+        sliders.append(Slider(name, path, label.replace("_", " ") or short, readable_unit(unit), low, high, value))
     return tuple(sliders)
 
 
@@ -249,84 +265,108 @@ def live_run(
     )
 
 
-# Pictures of a user's system: the first and the last component of its state as a point in a plane, and curves of all.
+# Pictures of a user's system: what its function `draw` returns, or a point in the plane of two components; and curves.
 
-#: Half the side of the drawn plane [m], and the radius of the point and the width of its trace, in the same unit.
-HALF, RADIUS, WIDTH = 1.0, 0.03, 0.012
+#: Half the longer side of the plane in which a point is drawn, the radius of the point, and its size for the camera [m].
+HALF, RADIUS, SIZE = 1.0, 0.04, 0.4
 
-#: The drawn components of a state: the first and the last.
-DRAWN_COMPONENTS = np.array([0, -1])
+#: Components whose spans have at most this ratio have the same scale, as the coordinates of a path.
+EQUAL = 4.0
 
-#: Number of lines of the plane's grid in each direction.
-LINES = 9
+#: In units of the size of a drawing: the width of lines and traces, and the ground around it. The height of the camera in units
+#: of its distance along the ground.
+WIDTH, MARGIN, RISE = 0.03, 0.3, 0.7
 
 
-def portraits(
-    runs: list["Trajectory"], overlaid: bool, drawn: tuple[np.ndarray, np.ndarray] | None = None
-) -> list[Stage]:
-    """Runs as stages: one stage for each, or a common one for overlaid runs.
+def point_of(runs: list["Trajectory"]) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
+    """The function that draws a state as a point: `(state - centre) * scale`, with the centre and the scales."""
+    points = np.concatenate([np.stack([np.asarray(run[name]) for name in run.portrait_axes], axis=-1) for run in runs])
+    points = points[np.all(np.isfinite(points), axis=-1)]
+    low, span = points.min(axis=0), np.ptp(points, axis=0)
+    span = np.where(span > 0.0, span, np.max(span) or 1.0)
+    span = np.full(2, np.max(span)) if np.max(span) < EQUAL * np.min(span) else span
+    centre, scale = low + 0.5 * np.ptp(points, axis=0), 2.0 * HALF / span
 
-    **Arguments:** `drawn`: middle and scales of the drawn part of the plane, by default that of the runs.
+    def draw(system: object, t: Array, y: Array) -> list[Ball]:
+        return [Ball((*((y[min(k, len(y) - 1)] - centre[k]) * scale[k] for k in (0, 1)), RADIUS), RADIUS)]
+
+    return draw, centre, scale
+
+
+def frame_of(parts: Sequence[AbstractPart | Line], curves: tuple[Array, ...], turning_rate: Array) -> Frame[Array]:
+    """What is drawn of a state, or of those at many times: a body without meshes amid the parts, the parts, and the lines."""
+    solids = [part for part in parts if isinstance(part, AbstractPart)]
+    lines = [part for part in parts if isinstance(part, Line)]
+    points = [*(part.place for part in solids), *(end for line in lines for end in (line.end, line.begin))]
+    middle = sum(points[1:], points[0]) / len(points)
+    zero, up = 0.0 * middle[..., 0], 0.0 * middle + np.array([0.0, 0.0, 1.0])
+    bodies = [(middle, jnp.concatenate([0.0 * middle, up[..., 2:]], axis=-1))]
+    for part in solids:
+        halves = [zero + 0.5 * jnp.asarray(angle) for angle in (part.heading, part.lean, part.spin)]
+        (c, d, e), (s, r, q) = map(jnp.cos, halves), map(jnp.sin, halves)
+        # The quaternion (x, y, z, w) of the lean after the spin, then that of the heading after these.
+        x, y, z, w = r * e, d * q, r * q, d * e
+        bodies.append((part.place, jnp.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], axis=-1)))
+    arrows = tuple((line.begin, line.end - line.begin) for line in lines)
+    return Frame(up, tuple(bodies), ((points[0], None),), arrows, curves, turning_rate)
+
+
+def stage_of(numbers: Sequence[int], runs: list["Trajectory"]) -> tuple[Callable[..., Any], Stage]:
+    """The function that draws runs, and the stage that shows the first of them.
+
+    **Arguments:** `numbers`: those of the runs that the stage shows; `runs`: these runs, and others for which the ground must
+    have room.
     """
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
-    groups = [list(enumerate(runs))] if overlaid else [[numbered] for numbered in enumerate(runs)]
-    stages = []
-    for group in groups:
-        points = np.concatenate([np.asarray(run.state)[:, DRAWN_COMPONENTS] for _, run in group])
-        centre, scale = frame_of(points) if drawn is None else drawn
-        shows = tuple(show(run, number, centre, scale) for number, run in group)
-        names = group[0][1].portrait_axes
-        stages.append(Stage(f"{names[1]} over {names[0]}", plane(scale), shows))
-    return stages
-
-
-def frame_of(points: Float[np.ndarray, "points 2"]) -> tuple[np.ndarray, np.ndarray]:
-    """The middle of some points, and the factors that scale them to the drawn plane."""
-    points = points[np.all(np.isfinite(points), axis=-1)]
-    low, high = points.min(axis=0), points.max(axis=0)
-    span = np.where(high > low, high - low, 1.0)
-    return 0.5 * (low + high), 1.8 * HALF / span
-
-
-def drawn_point(
-    xp: Any, states: Float[Array | np.ndarray, "*times components"], centre: np.ndarray, scale: np.ndarray, rate: float
-) -> Frame:
-    """The drawn quantities of some states. **Arguments:** `xp`: `numpy` or `jax.numpy`; `rate`: turning rate [rad/s]."""
-    one = xp.ones_like(states[..., :1])
-    position = xp.concatenate([(states[..., DRAWN_COMPONENTS] - centre) * scale, RADIUS * one], axis=-1)
-    upright, normal = one * np.array([0.0, 0.0, 0.0, 1.0]), one * np.array([0.0, 0.0, 1.0])
-    curves = tuple(xp.moveaxis(states, -1, 0))
-    return Frame(normal, ((position, upright),), ((position, None),), (), curves, rate * one[..., 0])
-
-
-def show(run: "Trajectory", number: int, centre: np.ndarray, scale: np.ndarray) -> Show:
-    """The drawing of one run, the `number`-th of all."""
-    colour = COLOURS[number % len(COLOURS)]
-    states = np.asarray(run.state)
-    is_reached = np.all(np.isfinite(states), axis=-1)
-    frames = drawn_point(np, states[is_reached], centre, scale, 0.0)
-    ((position, upright),) = frames.bodies
-    # An octahedron stands for the point.
-    vertices = RADIUS * np.concatenate([np.eye(3), -np.eye(3)])
-    corners = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
-    body = Body("state", position, upright, (Mesh(vertices, np.array(corners), colour),))
-    trace = Trace(" over ".join(run.portrait_axes[::-1]), position, colour, WIDTH)
-    times, curves = np.asarray(run.t)[is_reached], tuple(map(Curve, run.names, frames.curves))
-    return Show(f"run {number + 1}", colour, times, frames.normal, HALF, (body,), (trace,), (), curves)
-
-
-def plane(scale: np.ndarray) -> Arena:
-    """The drawn part of the plane, with lines at a spacing that is named."""
-    corners = HALF * np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
-    places = HALF * np.linspace(-1.0, 1.0, LINES)
-    ends = HALF * np.array([-1.0, 1.0])
-    lines = [np.stack([np.full(2, place), ends, np.zeros(2)], axis=-1) for place in places]
-    lines += [np.stack([ends, np.full(2, place), np.zeros(2)], axis=-1) for place in places]
-    spacing = 2.0 * HALF / (LINES - 1) / scale
-    text = f"{spacing[0]:.3g} by {spacing[1]:.3g}"
-    mesh = Mesh(corners, np.array([(0, 1, 2), (0, 2, 3)]), PALE)
-    return Arena(mesh, tuple(lines), text, np.array([0.0, 0.0, 1.0]))
+    models: list[Any] = [run.model for run in runs]
+    draw, centre, scale = (models[0].draw, np.zeros(2), np.ones(2)) if models[0].draw else point_of(runs)
+    names = ("x [m]", "y [m]") if models[0].draw else runs[0].portrait_axes
+    path = "path" if models[0].draw else " over ".join(names[::-1])
+    size, corners = 0.0 if models[0].draw else SIZE, []
+    drawn: list[tuple[Any, ...]] = []
+    for run, model in zip(runs, models, strict=True):
+        is_reached = np.all(np.isfinite(np.asarray(run.state)), axis=-1)
+        t, state = np.asarray(run.t)[is_reached], np.asarray(run.state)[is_reached]
+        with named_errors("draw(system, t, y)", "the system, the time and the state"):
+            parts: Any = jax.vmap(functools.partial(draw, model.parameters.tree["system"]))(t, state)
+        if not isinstance(parts, list) or not parts or not all(isinstance(part, AbstractPart | Line) for part in parts):
+            raise ValueError(f"draw must return a list of Box, Wheel, Disc, Ball and Line, not {shown(parts)}")
+        for part in parts:
+            if isinstance(part, Line):
+                ends = [part.begin, part.end]
+            else:
+                half = 0.5 * part.lengths if isinstance(part, Box) else part.radius[:, None] * np.ones(3)
+                ends = [part.place - half, part.place + half] if part.place.shape[1:] == (3,) else [part.place]
+            if any(end.shape[1:] != (3,) for end in ends):
+                raise ValueError(f"draw: a place in {type(part).__name__} must be three numbers, (x, y, z) in metres")
+            corners += map(np.asarray, ends)
+        frame = jax.tree.map(np.asarray, frame_of(parts, tuple(state.T), jnp.asarray(t)))
+        sizes = [np.linalg.norm(end - frame.bodies[0][0], axis=-1) for end in corners[-2 * len(parts) :]]
+        size = max(size, float(np.max(sizes)))
+        drawn.append((t, frame, parts))
+    low, high = (end(np.concatenate(corners), axis=0) for end in (np.min, np.max))
+    low, high = np.append(low[:2] - MARGIN * size, min(0.0, low[2])), high + MARGIN * size
+    ground = np.array([(x, y, low[2]) for x in (low[0], high[0]) for y in (low[1], high[1])])
+    axes = tuple(zip(names, centre.tolist(), scale.tolist(), strict=True))
+    arena = Arena(views.Mesh(ground, of_grid(2, 2)[:, ::-1], PALE), (), "", drawn[0][1].normal[0], axes)
+    shows = []
+    for number, run, (t, frame, parts) in zip(numbers, runs, drawn, strict=False):
+        colour, firsts = COLOURS[number % len(COLOURS)], jax.tree.map(lambda leaf: np.asarray(leaf)[0], parts)
+        meshes = [(), *(meshes_of(part, colour) for part in firsts if isinstance(part, AbstractPart))]
+        poses = zip(frame.bodies, meshes, strict=True)
+        bodies = tuple(views.Body("part", place, orientation, mesh) for (place, orientation), mesh in poses)
+        lines = zip([part for part in parts if isinstance(part, Line)], frame.arrows, strict=True)
+        arrows = tuple(
+            views.Arrow("line", begin, vector, "", 1.0, line.colour, 0.5 * (line.width or WIDTH * size))
+            for line, (begin, vector) in lines
+        )
+        traces = (views.Trace(path, frame.traces[0][0], colour, WIDTH * size),)
+        curves = tuple(map(views.Curve, run.names, frame.curves))
+        contents = (bodies, traces, arrows, curves)
+        shows.append(views.Show(f"run {number + 1}", colour, t, frame.normal, size, *contents))
+    title = models[0].title if models[0].draw else f"{models[0].title}: {path}"
+    return draw, Stage(title, arena, tuple(shows), rise=RISE)
 
 
 # One run of a user's system at given times.
@@ -352,18 +392,22 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
     def in_words(self) -> str:
         """The text of a single run."""
 
-    def explore(self, path: str | Path | None = None, sliders: Sliders | None = None, unit: Unit = None) -> Page:
+    def explore(self, path: Any = None, sliders: Sliders | None = None, unit: Unit = None, draw: Draw = None) -> Page:
         """A page with sliders that simulates the run in the browser, until its end; see `nonholonomic.explore`.
 
         **Raises:** as for `nonholonomic.explore`, and `ValueError` for a batch of runs.
         """
         require_one_run(self, "explore", "")
         model, t1 = self.of_page
-        return explore_model(model, path, sliders, t1, unit or self.unit)
+        return explore_model(drawn_by(model, draw), path, sliders, t1, unit or self.unit)
 
     @status_line("reading off")
     def to_table(self) -> Table:
         return self.table_of(())
+
+    def drawn_by(self, draw: Draw) -> Any:
+        """The run with a drawing for its pictures; raises `ValueError` unless it is one of your own system."""
+        return dataclasses.replace(self, **{"model": drawn_by(self.of_page[0], draw)})
 
     @status_line("reading off")
     def __str__(self) -> str:
@@ -439,8 +483,12 @@ class Trajectory(AbstractRun):
         return str(words) if words.ndim == 0 else words.astype(str)
 
     @property
+    def quantities(self) -> Mapping[str, Quantity]:
+        return self.model.quantities
+
+    @property
     def portrait_axes(self) -> tuple[str, str]:
-        return self.names[0], self.names[-1]
+        return self.names[0], self.names[:2][-1]
 
     @property
     def of_page(self) -> tuple[AbstractModel, float]:
@@ -507,32 +555,11 @@ class Trajectory(AbstractRun):
 
         **Raises:** `ValueError` for a batch of runs.
         """
-        if np.ndim(self.t) != 1 or np.ndim(self.state) != 2:
-            raise ValueError(
-                "this is a batch of runs, and to_table takes one run; nonholonomic.sweep makes a table of many"
-            )
+        require_one_run(self, "to_table", "; nonholonomic.sweep makes a table of many")
         columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
         request = self.model.description() | {"status": self.status, "end_time": float(self.end_time)}
         quantities = self.model.quantities | {"mode": Quantity("1", "mode")}
-        table = run_table(quantities, {"time": np.asarray(self.t)}, columns, ["time"], request)
-        # Earlier versions had only this attribute.
-        return dataclasses.replace(table, attributes=table.attributes | {"status": self.status})
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.names)
-
-    def __getattr__(self, name: str) -> Float[Array, " times"]:
-        # Python calls this only for names that are not attributes, also while a copy has none yet.
-        names = vars(self).get("names", ())
-        if name not in names:
-            known = ("t", "state", *names)
-            raise AttributeError(f"the run has no {name!r}{likely(name, known)}; it has {', '.join(known)}")
-        return self[name]
-
-    def __getitem__(self, name: str) -> Float[Array, " times"]:
-        if name not in self.names:
-            raise KeyError(f"{name!r} must be one of {', '.join(self.names)}{likely(name, self.names)}")
-        return self.state[..., self.names.index(name)]
+        return run_table(quantities, {"time": np.asarray(self.t)}, columns, ["time"], request)
 
     def at(self, times: ArrayLike | Sequence[float]) -> "Trajectory":
         """The same run at other times; the run is repeated.
@@ -561,19 +588,6 @@ class Trajectory(AbstractRun):
         numbers = list(zip(*texts, strict=True))
         return distinguishing_labels(numbers) if len(set(numbers)) > 1 else Tabular.labels_of(self, runs, unit)
 
-    def overview(self, runs: list[Any], labels: Sequence[str], unit: Unit, ax: Any) -> Any:
-        """Draw all components of a run in one picture, or a panel for each component of several runs."""
-        if len(runs) > 1 or unit is not None:
-            return Tabular.overview(self, [run._with_resets() for run in runs], labels, unit, ax)
-        figure = new_figure()
-        axes: Any = figure.add_subplot() if ax is None else ax
-        drawn = self._with_resets()
-        for name, component in zip(self.names, np.asarray(drawn.state).T, strict=True):
-            axes.plot(np.asarray(drawn.t), component, label=name)
-        axes.set_xlabel("time [s]")
-        axes.legend()
-        return figure if ax is None else ax
-
     def in_words(self) -> str:
         table = str(self.to_table()).splitlines()[1 : 1 + len(self.names)]
         lines = [f"Trajectory of {np.size(self.t)} times, {self.status} at {float(self.end_time):.6g} s", *table]
@@ -601,4 +615,6 @@ def brief_names(values: dict[str, list[str]]) -> dict[str, str]:
 
 @stages_of.register(Trajectory)
 def _(run: Trajectory, runs: list[Trajectory], overlaid: bool, unit: Unit) -> list[Stage]:
-    return portraits([run._with_resets() for run in runs], overlaid)
+    whole = [(number, run._with_resets()) for number, run in enumerate(runs)]
+    groups = [whole] if overlaid else [[numbered] for numbered in whole]
+    return [stage_of(*map(list, zip(*group, strict=True)))[1] for group in groups]

@@ -541,11 +541,6 @@ class Tabular(abc.ABC):
         """Labels that tell runs of this kind apart, in units as for `plot`; an empty one for a single run."""
         return [""] if len(runs) == 1 else [f"run {k + 1}" for k in range(len(runs))]
 
-    def overview(self, runs: list[Any], labels: Sequence[str], unit: Any, ax: Any) -> Any:
-        """Draw what is most important in this run and others; arguments as for `plot`."""
-        names = [name for name, values in self.to_table().variables.items() if values.dtype.kind == "f"]
-        return draw_series([run.to_table().drawn_in(unit, *names) for run in runs], names, labels, ax)
-
     @status_line("drawing")
     def plot(
         self,
@@ -560,7 +555,7 @@ class Tabular(abc.ABC):
         **Arguments:**
 
         - `quantities`: variables of `to_table()`, such as "theta" or "position", or components, such as "position.x"; by
-          default those that a page of the run shows, or all components of your own system.
+          default those that a page of the run shows.
         - `others`: other runs to draw in the same panels, a list.
         - `unit`: unit to draw in, such as "deg" for all angles, or several, such as ("deg", "ms").
         - `label`: text for the legend; with `others`, a list of one for each run. By default, labels name what differs.
@@ -573,12 +568,10 @@ class Tabular(abc.ABC):
         require_package("matplotlib", "plot", "plot")
         require_unit(unit)
         if len(quantities) == 1 and not isinstance(quantities[0], str):
-            # A list of names; or, as in earlier versions, a list of runs, or axes.
+            # A list of names; or, as in earlier versions, a list of runs.
             (first,) = quantities
             if isinstance(first, list | tuple) and first and all(isinstance(name, str) for name in first):
                 quantities = tuple(first)
-            elif hasattr(first, "set_xlabel"):
-                quantities, ax = (), first
             else:
                 quantities, others = (), first
         runs, unit = [self, *require_others(self, others)], unit or self.unit
@@ -596,8 +589,8 @@ class Tabular(abc.ABC):
         **Arguments:**
 
         - `x`, `y`: variables of `to_table()`, such as "theta" or "steering", or one component, such as "position.x". By
-          default `portrait` draws theta and its rate, the steering angle and the yaw rate, or the first and the last
-          component of your own system.
+          default `portrait` draws theta and its rate, the steering angle and the yaw rate, or the first two components of
+          your own system.
         - `ax`: matplotlib axes to draw in, instead of a new figure.
         - `unit`: unit to draw in, such as "deg" for all angles.
 
@@ -626,11 +619,14 @@ class Tabular(abc.ABC):
     def __getattr__(self, name: str) -> Any:
         # Python calls this for unknown names, and for known names whose property raised an AttributeError, which is
         # raised again here.
-        if name.startswith("_") or hasattr(type(self), name) or not self.readable:
+        readable = () if name.startswith("_") or hasattr(type(self), name) else self.readable or tuple(self.quantities)
+        if not readable:
             return object.__getattribute__(self, name)
+        if name in self.quantities:
+            return self[name]
         methods = [method for method in dir(type(self)) if not method.startswith("_")]
-        hint = "; did you mean 't'?" if name in ("time", "times") else likely(name, [*self.readable, *methods]) or "."
-        raise AttributeError(f"the run has no {name!r}{hint} It has {', '.join(['t', *self.readable])}")
+        hint = "; did you mean 't'?" if name in ("time", "times") else likely(name, [*readable, *methods]) or "."
+        raise AttributeError(f"the run has no {name!r}{hint} It has {', '.join(['t', *readable])}")
 
     def __repr__(self) -> str:
         return str(self)

@@ -21,36 +21,17 @@ from ..parameters import Parameters, checks_of, require_apart, short_names
 from ..runs.event import UNMEASURED
 from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
-from ..runs.trajectory import (
-    DRAWN_COMPONENTS,
-    TOLERANCE,
-    drawn_point,
-    frame_of,
-    live_run,
-    page_of,
-    portraits,
-    runs_at_ends,
-    sliders_of,
-)
+from ..runs.trajectory import TOLERANCE, frame_of, live_run, page_of, runs_at_ends, sliders_of, stage_of
 from ..sweeps import Axis, Quantity, Variable
 from ..text import name_of, shown
 from ..validation import as_number, is_traced
 from ..views import Stage
 from ..views.explore import Frame, LiveRun, Summary
+from ..views.stage import Draw
+from . import mechanics
 from .engine import ROUND_OFF, BatchedMode, time_and_state
 from .form import Event, Form, Hybrid, arguments_in_words, check_start, is_pair, require_event
-from .mechanics import (
-    RULES,
-    AbstractMode,
-    AbstractSystem,
-    Lagrange,
-    Parts,
-    components_of,
-    formulation_of,
-    parts_of_system,
-    problem_of_start,
-    rooms,
-)
+from .mechanics import AbstractSystem, Lagrange, components_of, formulation_of, parts_of_system
 
 # A user's own system as a model: its numbers by name, its modes, and its components.
 
@@ -58,13 +39,15 @@ from .mechanics import (
 class OwnModel(AbstractModel):
     """A `Hybrid` or an `AbstractSystem`, its start and its event, which is a part of `parameters`.
 
-    `form`: the form of the hybrid system; `names`: those of the components of a state.
+    `form`: the form of the hybrid system; `names`: those of the components of a state; `draw`: as for
+    `Trajectory.view`.
     """
 
     parameters: Parameters
     form: Form = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     event: None = None
+    draw: Draw = eqx.field(static=True, default=None)
 
     @classmethod
     def of(cls, tree: dict[str, Any]) -> "OwnModel":
@@ -104,16 +87,23 @@ class OwnModel(AbstractModel):
         values = zip(self.parameters.names, self.parameters.values, strict=True)
         return {"system": type(system).__name__, "event": name} | {name: float(value) for name, value in values}
 
+    @property
+    def title(self) -> str:
+        """The names of the classes of the system."""
+        system = self.parameters.tree["system"]
+        modes = system.modes if isinstance(system, Hybrid) else (system,)
+        return ", ".join(dict.fromkeys(type(mode).__name__ for mode in modes))
+
     def check(self) -> None:
         if is_traced(self):
             return
         parts = jax.tree.map(np.asarray, _compiled_parts(self))
-        left = rooms(parts, np)
+        left = mechanics.rooms(parts, np)
         system = self.parameters.tree["system"]
-        for rule in RULES:
+        for rule in mechanics.RULES:
             if rule in left and not left[rule] >= 0.0:
                 mode = f"modes[{system.first}]." if isinstance(system, Hybrid) else ""
-                raise ValueError(problem_of_start(parts, rule, mode))
+                raise ValueError(mechanics.problem_of_start(parts, rule, mode))
 
     def require_values(self, values: dict[str, ArrayLike]) -> None:
         for module, kind in checks_of(self.replaced(values).parameters.tree):
@@ -129,10 +119,10 @@ class OwnModel(AbstractModel):
                 self.require_values({axis.number: value})
 
     def legal(self) -> Bool[Array, "..."]:
-        return _all_left(rooms(_parts_of_cells(self), jnp))
+        return _all_left(mechanics.rooms(_parts_of_cells(self), jnp))
 
     def legal_cells(self, columns: dict[str, Array]) -> Bool[Array, " cells"]:
-        return _all_left(rooms(jax.tree.map(np.asarray, _compiled_parts(self.replaced(columns))), np))
+        return _all_left(mechanics.rooms(jax.tree.map(np.asarray, _compiled_parts(self.replaced(columns))), np))
 
     @property
     def smooth(self) -> bool:
@@ -214,7 +204,8 @@ class OwnModel(AbstractModel):
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        return {name: Quantity("1", name) for name in self.names}
+        reads = [lambda run, k=k: run.state[..., k] for k in range(len(self.names))]
+        return {name: Quantity("1", name, read=read) for name, read in zip(self.names, reads, strict=True)}
 
     def read(
         self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: object
@@ -264,16 +255,16 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array]:
     return Hybrid([formulation], event), formulation.state(start["q"], start["rate"])
 
 
-def _all_left(left: Parts) -> Any:
+def _all_left(left: mechanics.Parts) -> Any:
     """Whether no rule of a start is broken."""
     return functools.reduce(operator.and_, (room >= 0.0 for room in left.values()))
 
 
-def _parts_of_cells(model: OwnModel) -> Parts:
+def _parts_of_cells(model: OwnModel) -> mechanics.Parts:
     """What the rules compare: the start, the functions of a mechanical first mode, and the least of its margins; for all
     cells."""
 
-    def of_one(*numbers: Array) -> Parts:
+    def of_one(*numbers: Array) -> mechanics.Parts:
         tree = model.parameters.form.tree(numbers)
         system = tree["system"]
         first = system.modes[system.first] if isinstance(system, Hybrid) else system
@@ -327,13 +318,6 @@ def _(
     return OwnModel.of({"system": system, "start": numbers, "event": event})
 
 
-@model_of.register(AbstractMode)
-def _(system: AbstractMode, *arguments: object, **options: object) -> OwnModel:
-    raise ValueError(
-        f"system = {shown(system)} must be a Hybrid or an AbstractSystem; wrap modes in nonholonomic.Hybrid([...])"
-    )
-
-
 #: Names of other columns of tables and trajectories.
 TAKEN = ("time", "status", "end_time", "steps", "rejected", "switches", "mode", "grazes")
 
@@ -380,9 +364,7 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
         values = {name: float(model.value(name)) for name in names[:DEFAULT_SLIDERS]}
         ranges = {name: tuple(sorted((0.5 * value, 2.0 * value))) for name, value in values.items()}
     sliders = sliders_of(model, ranges)
-    runs, names = runs_at_ends(model, sliders, t1), model.names
-    centre, scale = frame_of(np.concatenate([np.asarray(run.state)[:, DRAWN_COMPONENTS] for run in runs]))
-    (stage,) = portraits(runs[:1], False, (centre, scale))
+    names, (draw, stage) = model.names, stage_of([0], runs_at_ends(model, sliders, t1))
 
     def outcome(model: OwnModel, ended: HybridOutcome) -> tuple[Array, Array]:
         if model.has_event:
@@ -393,7 +375,10 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
         return model.ended(ended, TOLERANCE)[0], result[0]
 
     def frame(model: OwnModel, time: object, rows: Array, mode: object) -> Frame:
-        return drawn_point(jnp, model.components_of(rows[:, 0]), centre, scale, 2.0 * np.pi * TURNS / t1)
+        components = model.components_of(rows[:, 0])
+        rate = jnp.asarray(2.0 * np.pi * TURNS / t1) + 0.0 * components[0]
+        parts = draw(model.parameters.tree["system"], time, components)
+        return frame_of(parts, tuple(components), rate)
 
     live = live_run(
         model,
@@ -402,7 +387,7 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
         t1,
         outcome,
         frame,
-        title=type(model.parameters.tree["system"]).__name__,
+        title=model.title,
         answer=("time of the event", "s") if model.has_event else (f"{names[0]} at the end", ""),
         summaries=tuple(Summary(name, "", k) for k, name in enumerate(names[:2])),
     )

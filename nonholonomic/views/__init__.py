@@ -24,12 +24,17 @@ from .stage import DARK as DARK
 from .stage import PALE as PALE
 from .stage import Arena as Arena
 from .stage import Arrow as Arrow
+from .stage import Ball as Ball
 from .stage import Body as Body
+from .stage import Box as Box
 from .stage import Curve as Curve
+from .stage import Disc as Disc
+from .stage import Line as Line
 from .stage import Mesh as Mesh
 from .stage import Show as Show
 from .stage import Stage as Stage
 from .stage import Trace as Trace
+from .stage import Wheel as Wheel
 from .stage import arena as arena
 from .stage import ball as ball
 from .stage import bar as bar

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -31,7 +31,7 @@ from ..terminal import status_line
 from ..text import Unit, require_unit, shown
 from ..validation import replacing, require, require_file, require_increasing, require_package
 from .plot import draw_curves
-from .stage import Arrow, Body, Curve, Mesh, Show, Stage, Trace, css, curves_in, finite
+from .stage import Arrow, Body, Curve, Draw, Mesh, Show, Stage, Trace, css, curves_in, finite
 
 # Only for type checkers: matplotlib is optional.
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ class _Numbers:
 def _stage(stage: Stage, numbers: _Numbers) -> dict[str, object]:
     """The data of a stage for the script."""
     place, target, follow = view_from(stage)
-    keys = [(stage.arena.spacing, "")]
+    keys = [(stage.arena.spacing, "")] if stage.arena.spacing else []
     if len(stage.shows) > 1:
         keys += [(show.name, css(show.colour)) for show in stage.shows]
     return {
@@ -213,7 +213,8 @@ def _stage(stage: Stage, numbers: _Numbers) -> dict[str, object]:
         "size": max(show.size for show in stage.shows),
         "background": css(BACKGROUND),
         "lines": css(LINES),
-        "arena": numbers.described(stage.arena.mesh) | {"lines": [numbers.add(line) for line in stage.arena.lines]},
+        "arena": numbers.described(stage.arena.mesh)
+        | {"lines": [numbers.add(line) for line in stage.arena.lines], "axes": stage.arena.axes},
         "runs": numbers.described(stage.shows),
     }
 
@@ -361,6 +362,7 @@ class Viewable:
         others: Sequence[Any] = (),
         overlaid: bool = False,
         unit: Unit = None,
+        draw: Draw = None,
     ) -> Page:
         """An animated page of the run: body, arena, traces, arrows, and curves over time (needs jupyter-threejs-sage).
 
@@ -372,6 +374,8 @@ class Viewable:
         - `others`: other runs to show at the same time.
         - `overlaid`: whether to draw all runs in the arena of the first, instead of side by side.
         - `unit`: unit of the curves and of the names of the runs, as for `plot`, such as ("deg", "rpm").
+        - `draw`: for your own system, a function `draw(system, t, y)` that returns a list of `views.Box`, `Wheel`, `Disc`,
+          `Ball` and `Line`; the first part leaves a trace. By default, the first two components of the state are a path.
 
         **Returns:** a `Page`, with its `html`.
 
@@ -383,7 +387,7 @@ class Viewable:
         require_package("jupyter_threejs_sage", "view", "view")
         if path is not None:
             require_file(path, "path", ".html", ".htm")
-        stages = self._stages(others, overlaid, unit)
+        stages = self._stages(others, overlaid, unit, draw)
         html_page = page(stages, "; ".join(stage.title for stage in stages), speed=0.5)
         if path is not None:
             html_page.save(path)
@@ -399,6 +403,7 @@ class Viewable:
         speed: float | None = None,
         fps: float = 25.0,
         unit: Unit = None,
+        draw: Draw = None,
     ) -> None:
         """Write a film for slides: the page of the run, recorded by Chromium, Chrome or Edge without a window (needs
         jupyter-threejs-sage). It plays the run in real time unless you give a `speed`; the film states time and speed.
@@ -407,7 +412,7 @@ class Viewable:
 
         - `path`: file with a name that ends in .webm.
         - `times`: increasing times [s] of the frames; by default the whole run at the given speed.
-        - `others`, `overlaid`, `unit`: as for `view`.
+        - `others`, `overlaid`, `unit`, `draw`: as for `view`.
         - `speed`: seconds of the run per second of the film, 1 by default; 0.1 is ten times slower than reality. With
           `times`, the speed follows from `times` and `fps`.
         - `fps`: frames per second. Without a graphics card, drawing takes about 0.3 s for each frame.
@@ -436,7 +441,7 @@ class Viewable:
                 "animate needs Chromium, Chrome or Edge, and finds none: install one, for example by `apt install chromium` or "
                 "from google.com/chrome; or open the page of run.view(path) in any browser and press its button Save film"
             )
-        stages = self._stages(others, overlaid, unit)
+        stages = self._stages(others, overlaid, unit, draw)
         scripts = [script(RECORD.replace("[REQUEST]", json.dumps(request)))]
         html_page = page(
             stages, "; ".join(stage.title for stage in stages), height=HEIGHT, scripts=scripts, autoplay=False
@@ -450,11 +455,11 @@ class Viewable:
             raise ValueError("ax takes one quantity: name it, as in plot('energy', ax=ax)")
         return draw_curves(curves_in(self.stages(runs[1:]), unit), labels)
 
-    def _stages(self, others: Sequence[Any], overlaid: bool, unit: Unit) -> list[Stage]:
+    def _stages(self, others: Sequence[Any], overlaid: bool, unit: Unit, draw: Draw) -> list[Stage]:
         """The stages in a unit, after a check of the unit and that the others are runs of the same package."""
         require_unit(unit)
-        unit = unit or self.unit
-        return curves_in(self.stages(require_others(self, others), overlaid, unit), unit)
+        others, run, unit = require_others(self, others), cast(Any, self), unit or self.unit
+        return curves_in((run if draw is None else run.drawn_by(draw)).stages(others, overlaid, unit), unit)
 
 
 def require_others(run: object, others: Any) -> Sequence[Any]:

@@ -97,7 +97,7 @@ window.views = window.views || {};
       };
       // Traces of several runs have the colours of the runs, which the caption explains beside the names of the runs.
       fact.runs[0].traces.forEach((trace, k) => chip("traces", fact.runs.length > 1 ? { ...trace, colour: "#6b7280" } : trace, k));
-      stage.values = fact.runs[0].arrows.map((arrow, k) => chip("arrows", arrow, k));
+      stage.values = fact.runs[0].arrows.map((arrow, k) => (arrow.unit ? chip("arrows", arrow, k) : null));
       return stage;
     }
 
@@ -235,7 +235,7 @@ window.views = window.views || {};
         stage.render();
         stage.values.forEach((value, k) => {
           const { size, unit } = stage.runs[0].arrows[k];
-          value.textContent = ` ${views.digits(size, 3)} ${unit}`;
+          if (value) value.textContent = ` ${views.digits(size, 3)} ${unit}`;
         });
       }
       this.strips.draw(this.now);

@@ -93,7 +93,7 @@ window.views = window.views || {};
       return geometry;
     }
     // Draw only the front of the surface, so that a wall between camera and body hides nothing.
-    arena({ vertices, triangles, colour, lines }) {
+    arena({ vertices, triangles, colour, lines, axes }) {
       const { THREE } = this, geometry = this.geometry({ positions: vertices });
       geometry.setIndex(new THREE.BufferAttribute(triangles, 1));
       geometry.computeVertexNormals();
@@ -101,11 +101,34 @@ window.views = window.views || {};
       ground.receiveShadow = true;
       this.scene.add(ground);
       const pairs = [];
-      for (const line of lines) for (let k = 0; k + 5 < line.length; k += 3) pairs.push(...line.subarray(k, k + 6));
+      for (const line of [...lines, ...this.axes(axes, vertices)]) for (let k = 0; k + 5 < line.length; k += 3) pairs.push(...line.subarray(k, k + 6));
       const grid = this.geometry({ positions: new Float32Array(pairs) });
       this.scene.add(new THREE.LineSegments(grid, new THREE.LineBasicMaterial({ color: this.fact.lines, transparent: true, opacity: 0.55 })));
     }
 
+    // Lines at round values over a level rectangle, with labels along two of its sides, between which the names stand.
+    axes(axes, vertices) {
+      const [low, high] = [vertices.subarray(0, 3), vertices.subarray(9, 12)], lines = [];
+      const gap = 0.05 * max(high[0] - low[0], high[1] - low[1]);
+      this.marks = [];
+      axes.forEach(([name, centre, scale], k) => {
+        const [begin, end] = [low[k], high[k]].map((place) => centre + place / scale), least = max((end - begin) / 50, min((end - begin) / 7, (0.6 * this.size) / scale));
+        const power = 10 ** Math.floor(Math.log10(least)), step = power * [1, 2, 5, 10].find((factor) => factor * power >= 0.999 * least);
+        const point = (along, across) => (k ? [across, along, low[2]] : [along, across, low[2]]);
+        const mark = (textContent, along, away) => this.marks.push({
+          label: element("span", this.labels, { className: "mark", textContent }),
+          at: new this.THREE.Vector3(...point(along, low[1 - k] - away * gap)),
+        });
+        const first = Math.ceil(begin / step - 1e-9), count = Math.floor(end / step + 1e-9) - first + 1;
+        for (let n = first; n < first + count; n++) {
+          const along = (n * step - centre) * scale;
+          lines.push(Float32Array.from([...point(along, low[1 - k]), ...point(along, high[1 - k])]));
+          if (count <= 12) mark(String(Number((n * step).toPrecision(6))), along, 1);
+        }
+        mark(name, (low[k] + high[k]) / 2, count <= 12 ? 3 : 1);
+      });
+      return lines;
+    }
     run(fact) {
       const bodies = fact.bodies.map((body) => this.body(body.meshes));
       const traces = fact.traces.map((trace) => this.trace(trace));
@@ -141,12 +164,14 @@ window.views = window.views || {};
       trace.line.geometry.setPositions(points.length > 3 ? points : [...points, ...points]);
     }
     // A shaft of length one, which is scaled, and a tip; an arrow that is visible through the body has a ball at its start.
+    // A line has no unit, and no tip.
     arrow({ colour, width, through, unit, scale, limit, shown }) {
-      const { THREE, scene } = this, group = new THREE.Group(), head = 5 * width;
+      const { THREE, scene } = this, group = new THREE.Group(), head = unit ? 5 * width : 0;
       const material = new THREE.MeshPhongMaterial({ color: colour, specular: 0, depthTest: !through, transparent: through });
       const part = (geometry) => {
         const mesh = new THREE.Mesh(geometry, material);
         mesh.renderOrder = through ? 2 : 0;
+        mesh.castShadow = !unit;
         group.add(mesh);
         return mesh;
       };
@@ -182,7 +207,7 @@ window.views = window.views || {};
       group.quaternion.setFromUnitVectors(new this.THREE.Vector3(0, 1, 0), new this.THREE.Vector3(...vector).normalize());
       shaft.scale.set(1, max(length - head, 1e-9), 1);
       tip.position.set(0, length - head, 0);
-      tip.scale.setScalar(max(head / arrow.head, 1e-9));
+      tip.scale.setScalar(max(head / (arrow.head || 1), 1e-9));
       arrow.length = length;
     }
     setNormal(run, normal) { this.runs[run].normal = normal; }
@@ -277,6 +302,11 @@ window.views = window.views || {};
         const at = point.clone().project(camera);
         return [((at.x + 1) / 2) * width, ((1 - at.y) / 2) * height, at.z < 1 && Math.abs(at.x) < 1 && Math.abs(at.y) < 1];
       };
+      for (const { label, at } of this.marks) {
+        const [x, y, seen] = onScreen(at);
+        label.style.display = seen ? "" : "none";
+        label.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -50%)`;
+      }
       const taken = [];
       // A label that would overlap another one moves up.
       const put = (label, [x, below, seen], lift) => {

@@ -4,16 +4,21 @@ This module does not depend on tops or strollers. Lengths are in metres in the f
 seconds.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..geometry import AbstractSurface
 from ..text import Unit, in_unit, require_unit_of
 
 Points = Float[np.ndarray, "times 3"]
+
+#: A function of your own system, the time and the state that returns the parts of its drawing, or `None` for a default.
+Draw = Callable[..., Sequence["AbstractPart | Line"]] | None
 
 
 class Mesh(NamedTuple):
@@ -48,7 +53,7 @@ class Trace(NamedTuple):
 
 
 class Arrow(NamedTuple):
-    """A vector that changes over time: its start, and its components in `unit`.
+    """A vector that changes over time: its start, and its components in `unit`; without a unit, a line without a tip.
 
     It is drawn `scale` metres long per unit, and no longer than `limit` [m]. With `through`, it is visible through the
     body and has a ball at its start. `shown`: whether a page shows it at first.
@@ -96,12 +101,17 @@ class Show(NamedTuple):
 
 
 class Arena(NamedTuple):
-    """A part of a surface: its mesh, the lines on it and their spacing as text, and a normal towards the body."""
+    """A part of a surface: its mesh, the lines on it and their spacing as text, and a normal towards the body.
+
+    `axes`: for a level rectangle without lines, the name of each axis, and the centre and the scale at which its values are
+    drawn; the page draws lines at round values.
+    """
 
     mesh: Mesh
     lines: tuple[Float[np.ndarray, "points 3"], ...]
     spacing: str
     normal: Float[np.ndarray, " 3"]
+    axes: tuple[tuple[str, float, float], ...] = ()
 
 
 class Stage(NamedTuple):
@@ -250,6 +260,71 @@ def wheel(radius: float, width: float, colours: tuple[int, int]) -> tuple[Mesh, 
     colours_of_spokes = (colours[1], colours[0], colours[0])
     spokes = [bar(ends[k + 3], ends[k], 0.35 * half, colour) for k, colour in enumerate(colours_of_spokes)]
     return tyre._replace(vertices=tyre.vertices @ rotation), *spokes
+
+
+# The parts that draw your own system, for one state or for the states at many times.
+
+
+class AbstractPart(eqx.Module):
+    """A rigid part of a drawing, with its middle at `place` [m]: first it spins about the y axis, then it leans about the x
+    axis, then it turns to its heading about the z axis [rad]; `colour`: 0xrrggbb, by default that of the run."""
+
+    place: Float[Array, "*times 3"] = eqx.field(converter=jnp.asarray)
+    heading: Float[ArrayLike, "*times"] = eqx.field(default=0.0, kw_only=True)
+    lean: Float[ArrayLike, "*times"] = eqx.field(default=0.0, kw_only=True)
+    spin: Float[ArrayLike, "*times"] = eqx.field(default=0.0, kw_only=True)
+    colour: int | None = eqx.field(default=None, kw_only=True, static=True)
+
+
+class Box(AbstractPart):
+    """A box with edges of these `lengths` along its own axes [m]; `place`, `heading`, `lean`, `spin`, `colour`: as for all
+    parts.
+
+    **Example:**
+
+    >>> from nonholonomic.views import Box
+    >>> Box((1.0, 2.0, 0.1), (0.8, 0.4, 0.2), heading=0.5).place.tolist()
+    [1.0, 2.0, 0.1]
+    """
+
+    lengths: Float[Array, "*times 3"] = eqx.field(converter=jnp.asarray)
+
+
+class Wheel(AbstractPart):
+    """A wheel of a `radius` [m] about its own y axis, with spokes that show its `spin`; the rest as for `Box`."""
+
+    radius: Float[ArrayLike, "*times"]
+
+
+class Disc(Wheel):
+    """A thin disc of a `radius` [m] about its own y axis; the rest as for `Box`."""
+
+
+class Ball(Wheel):
+    """A ball of a `radius` [m], with sectors that show how it turns; the rest as for `Box`."""
+
+
+class Line(eqx.Module):
+    """A line between two moving points [m], such as a rod or a spring; `width` [m], by default a part of the drawing."""
+
+    begin: Float[Array, "*times 3"] = eqx.field(converter=jnp.asarray)
+    end: Float[Array, "*times 3"] = eqx.field(converter=jnp.asarray)
+    width: float | None = eqx.field(default=None, kw_only=True, static=True)
+    colour: int = eqx.field(default=DARK, kw_only=True, static=True)
+
+
+def meshes_of(part: Any, colour: int) -> tuple[Mesh, ...]:
+    """The meshes of a rigid part at one time. **Arguments:** `colour`: that of the run."""
+    colour = colour if part.colour is None else part.colour
+    if isinstance(part, Box):
+        length, width, height = map(float, part.lengths)
+        return (box((length, width, height), (0.0, 0.0, 0.0), colour),)
+    radius = float(part.radius)
+    if isinstance(part, Ball):
+        return ball(radius, (colour, PALE))
+    if isinstance(part, Disc):
+        return (bar((0.0, 0.06 * radius, 0.0), (0.0, -0.06 * radius, 0.0), radius, colour),)
+    return wheel(radius, 0.3 * radius, (DARK if part.colour is None else colour, PALE))
 
 
 # The part of a surface on which runs take place. It is drawn from the chart of the surface or from nearest points.

@@ -14,18 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from nonholonomic import identification
 from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import Plane
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.identification import (
-    AbstractRecording,
-    Free,
-    Identification,
-    LogDensity,
-    Quantities,
-    as_quantity,
-    read_columns,
-)
 from nonholonomic.integration import AbstractProblem, Outcome
 from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_run
 from nonholonomic.parameters import description, full_axes, numbers, numbers_of
@@ -391,7 +383,7 @@ EXPECTED = "a Recording or a nonholonomic.EventTimes"
 def identify(
     scene: Scene,
     data: Data | Sequence[Data],
-    free: Mapping[str, Free | float],
+    free: Mapping[str, identification.Free | float],
     *,
     starts: int = 16,
     spread: float = 2.0,
@@ -399,7 +391,7 @@ def identify(
     tolerance: float = 1e-8,
     max_steps: int = 60,
     progress: bool = True,
-) -> Identification:
+) -> identification.Identification:
     """Estimate parameters of a scene and its launch from measurements, with errors and undetermined combinations.
 
     **Arguments:**
@@ -440,11 +432,11 @@ def identify(
 def log_density(
     scene: Scene,
     data: Data | Sequence[Data],
-    free: Mapping[str, Free | float],
+    free: Mapping[str, identification.Free | float],
     priors: Mapping[str, Prior] | None = None,
     *,
     tolerance: float = 1e-8,
-) -> LogDensity:
+) -> identification.LogDensity:
     """The log of the posterior density of the parameters of a scene and its launch, as a function of unbounded coordinates.
 
     **Arguments:** `scene`, `data`, `free`, `tolerance`: as for `identify`; `priors`: as for `tippe.log_density`.
@@ -474,7 +466,7 @@ def log_density(
 # Recorded rides of strollers, from arrays and from files.
 
 #: The quantities of a ride that can be recorded, with the names of a `Trajectory`'s properties.
-RECORDED = Quantities(
+RECORDED = identification.Quantities(
     columns={"position": ("x", "y", "z")},
     units=dict.fromkeys(("x", "y", "z"), "m")
     | {"heading": "rad", "steering": "rad", "speed": "m/s", "yaw_rate": "rad/s", "steering_rate": "rad/s"},
@@ -483,7 +475,7 @@ RECORDED = Quantities(
 )
 
 
-class Recording(AbstractRecording):
+class Recording(identification.AbstractRecording):
     """A recorded ride: quantities sampled at the times of a clock.
 
     **Arguments:**
@@ -514,10 +506,10 @@ class Recording(AbstractRecording):
     """
 
     launch: Launch
-    quantity: str | tuple[str, ...] = eqx.field(static=True, default="position", converter=as_quantity)
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="position", converter=identification.as_quantity)
     input: Input | None = None
     jumps: Sequence[float] | Array | None = None
-    quantities: ClassVar[Quantities] = RECORDED
+    quantities: ClassVar[identification.Quantities] = RECORDED
 
     def model(self, scene: object) -> AbstractModel:
         """The model of the recorded ride, checked."""
@@ -574,5 +566,5 @@ def read_recording(
     >>> print(ride.times, ride.value.round(2))
     [0. 1. 2.] [1.5  1.39 1.31]
     """
-    table = read_columns(path, columns, fps, error, RECORDED, decimal)
+    table = identification.read_columns(path, columns, fps, error, RECORDED, decimal)
     return Recording(launch, *table, input=input, t0=t0, student=student, jumps=jumps)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from nonholonomic import validation
 from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
 from nonholonomic.integration import ImplicitMidpoint, Settings, explicit_tableau, follow, sample
@@ -22,15 +23,6 @@ from nonholonomic.runs.simulate import evenly_spaced, sampled_if_legal
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import Unit, distinguishing_labels
-from nonholonomic.validation import (
-    as_known,
-    is_traced,
-    nan_unless,
-    require_one_run,
-    require_outside,
-    require_whole,
-    times_within,
-)
 
 from ..model.dynamics import Power, State, padded
 from ..model.input import Input
@@ -167,7 +159,7 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: S
 def names_of(runs: list[Any], unit: Unit = None) -> list[str]:
     """Names of rides, by what differs in their durations, scenes and launches. **Arguments:** `unit`: as for `plot`."""
     for run in runs:
-        require_one_run(run, "a picture", ", and pass the others as others=")
+        validation.require_one_run(run, "a picture", ", and pass the others as others=")
     starts = [(f"ride of {float(run.t[-1]):.3g} s",) for run in runs]
     scenes, launches = ([getattr(run.model, name) for run in runs] for name in ("scene", "launch"))
     return distinguishing_labels(starts, scenes, launches, unit=unit)
@@ -415,10 +407,10 @@ class Trajectory(AbstractRun):
 
         **Raises:** `ValueError` for times outside the ride, inside a transformation, and for a batch.
         """
-        require_outside((self.t, times), "at", "times= of simulate")
-        require_one_run(self, "at", "")
+        validation.require_outside((self.t, times), "at", "times= of simulate")
+        validation.require_one_run(self, "at", "")
         steps = self._all_steps
-        times = times_within(times, steps.times[-1], "ride")
+        times = validation.times_within(times, steps.times[-1], "ride")
         read = read_off_compiled(self.spec, times, steps.at(self.spec, times), self.stats)
         return dataclasses.replace(read, steps=steps)
 
@@ -478,7 +470,7 @@ class Trajectory(AbstractRun):
         return "contact_lost" if np.isfinite(self.contact_lost_at) else "completed"
 
     def table_of(self, names: Sequence[str]) -> Table:
-        require_one_run(self, "to_table", "; stroller.sweep makes a table of many")
+        validation.require_one_run(self, "to_table", "; stroller.sweep makes a table of many")
         return table_of([self], [], self.model.description() | {"status": self.status}, names)
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
@@ -545,14 +537,14 @@ def ride(
     """The trajectory of a `RideModel`. **Arguments:** as for `stroller.simulate`; the model was checked."""
     if not isinstance(solver, ImplicitMidpoint):
         require_adaptive(solver, ", or an ImplicitMidpoint")
-    require_whole(max_steps, "max_steps", 1)
+    validation.require_whole(max_steps, "max_steps", 1)
     require_adjoint(adjoint)
-    end, grid = as_known(t1), None
-    times = evenly_spaced(end) if times is None else as_known(times)
+    end, grid = validation.as_known(t1), None
+    times = evenly_spaced(end) if times is None else validation.as_known(times)
     require_times(times, t1)
     if isinstance(solver, ImplicitMidpoint):
         jumps = model.problem(None, ()).jump_times
-        known = jumps is not None and not is_traced((jumps, times, end))
+        known = jumps is not None and not validation.is_traced((jumps, times, end))
         inside = [time for time in np.asarray(jumps) if 0.0 < time < end] if known else []
         grid = even_steps(jnp.asarray(np.union1d(times, inside)) if inside else times, end, solver.step_length)
         max_steps = grid.size
@@ -560,7 +552,7 @@ def ride(
     # Inside a transformation, this traces all numbers, even if they are known.
     ride = Ride(model, jnp.add(end, 0.0), settings, grid)
     spec = RideSpec(*eqx.partition(ride, eqx.is_array_like))
-    inside = is_traced((spec, times))
+    inside = validation.is_traced((spec, times))
     # Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
     if inside or not isinstance(settings.for_steps_alone, diffrax.AbstractERK | ImplicitMidpoint):
         return _sampled(spec, times, adjoint if inside else None)
@@ -579,7 +571,9 @@ def _sampled(spec: RideSpec, times: Float[Array, " times"], adjoint: diffrax.Abs
     accepted = (outcome.steps[0] - outcome.rejected[0]).astype(int)
     stats = Stats(accepted, rejected, is_legal & (outcome.status[0] == REACHED_END))
     run = read_off(spec, times, samples.rows, stats)
-    return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(is_legal, run), (times, stats))
+    return eqx.tree_at(
+        lambda trajectory: (trajectory.t, trajectory.stats), validation.nan_unless(is_legal, run), (times, stats)
+    )
 
 
 def even_steps(
@@ -590,7 +584,7 @@ def even_steps(
     **Raises:** `ValueError` if an argument is traced, because the number of steps is part of the program.
     """
     for name, number in {"t1": t1, "times": times, "step_length": max_duration}.items():
-        if is_traced(number):
+        if validation.is_traced(number):
             raise ValueError(
                 f"{name} is traced and must be known for ImplicitMidpoint, whose steps have a given length"
             )
