@@ -337,9 +337,9 @@ def read_inversion_times(
                 f"columns must have {name!r}, or launch must be a Launch with the {name} of all launches, such as "
                 "launch=tippe.Launch(theta=0.1, spin=150.0)"
             )
-    launches = Launch(**table.numbers) if launch is None else dataclasses.replace(launch, **table.numbers)
-    times: Any = {"time": table.time, "error": table.error, "t1": t1, "until": limits}
-    return InversionTimes(launch=launches, **times, angle=angle, student=student)
+    numbers: Any = table.numbers
+    launches = Launch(**numbers) if launch is None else dataclasses.replace(launch, **numbers)
+    return InversionTimes(launches, table.time, table.error, t1, until=limits, angle=angle, student=student)
 
 
 # Recorded runs of tops, from arrays and from files.
