@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -576,6 +576,9 @@ class Trajectory(AbstractRun):
     def table_of(self, names: Sequence[str]) -> Table:
         """The table that pictures draw, with the states before and after each reset."""
         return self._with_resets().to_table()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         """Labels that tell runs apart by the numbers of their systems and starts that differ."""

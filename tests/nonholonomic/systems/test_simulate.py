@@ -355,7 +355,7 @@ def test_components_have_the_names_of_the_system():
     table = sweep(Hybrid([NamedBall()]), [1.0, 0.0, 0.0], 0.3, axes={"start[0]": [1.0, 2.0]}, progress=False)
     assert_close(table.height, np.array([1.0, 2.0]) - 0.5 * GRAVITY * 0.09, rtol=1e-12)
     turning = simulate(NamedSleigh(), ([0.0, 0.0, 0.0], [1.0, 0.0, 1.3]), 0.5, times=[0.5])
-    assert list(turning.names) == ["x", "y", "heading", "x_rate", "y_rate", "heading_rate"]
+    assert list(turning) == list(turning.names) == ["x", "y", "heading", "x_rate", "y_rate", "heading_rate"]
 
 
 @pytest.mark.parametrize("words", [("height",), ("height", "height", "bounces"), ("height", "time", "bounces"), "abc"])
