@@ -46,7 +46,7 @@ def main() -> None:
     labels = tuple(f"Table {2 if table is paper.TABLE_2 else 3}, theta {row.theta:.3g}" for table, row in ROWS)
     free = {name: Free(start, *bounds) for name, start, bounds in zip(NAMES, TOPS[0], BOUNDS, strict=False)}
     free |= {"azimuth": Free(TOPS[0][6]), "mu [s/m]": Free(TOPS[0][7], 0.0, prior=(0.3, 0.03))}
-    print((fit := identify(model, data, free, max_steps=10, labels=labels)).details)
+    print(fit := identify(model, data, free, max_steps=10, labels=labels), fit.details, sep="\n")
     print(f"It misses the tables by {(fit.deviance / fit.degrees) ** 0.5:.2g} s. Other tops do as well; deviances:")
     predicted = jax.jit(model)(dict(zip(NAMES, jnp.asarray(TOPS.T), strict=True)))
     print(np.sum(data.residuals(predicted) ** 2, axis=1) + ((TOPS[:, 7] - 0.3) / 0.03) ** 2)

@@ -105,9 +105,6 @@ def as_one(values: Any, name: str, kind: type) -> Any:
     stacked = {}
     for field in dataclasses.fields(kind):
         parts = [getattr(value, field.name) for value in values]
-        if field.metadata.get("static"):
-            stacked[field.name] = parts[0]
-            continue
         counts = {len(part) for part in parts if isinstance(part, tuple)}
         if len(counts) > 1 or (field.name not in RESTING and counts and None in parts):
             sizes = ", ".join("none" if part is None else str(len(part)) for part in parts)

@@ -272,10 +272,12 @@ def contents(module: PyTree, with_units: bool = True) -> list[tuple[str, str]]:
     units, rows = getattr(module, "units", {}), []
     for field in dataclasses.fields(module):
         value = getattr(module, field.name, None)
-        if value is not None and field.name != "unit":
-            # A launch knows the unit in which it was stated.
-            unit, factor = in_unit(units.get(field.name, "1"), getattr(module, "unit", None) if with_units else None)
-            value = value if factor == 1.0 else jax.tree.map(lambda part, factor=factor: factor * part, value)
+        if value is not None:
+            # A launch knows in which units it was stated.
+            unit, factor = units.get(field.name, "1"), 1.0
+            if not isinstance(value, tuple):
+                unit, factor = in_unit(unit, getattr(module, "shown_in", None))
+                value = value if factor == 1.0 else factor * value
             rows.append((field.name, as_text(value, unit if with_units else None)))
     return rows
 

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -337,8 +337,7 @@ def read_inversion_times(
                 f"columns must have {name!r}, or launch must be a Launch with the {name} of all launches, such as "
                 "launch=tippe.Launch(theta=0.1, spin=150.0)"
             )
-    numbers: Any = table.numbers
-    launches = Launch(**numbers) if launch is None else dataclasses.replace(launch, **numbers)
+    launches = Launch(**table.numbers) if launch is None else dataclasses.replace(launch, **table.numbers)
     return InversionTimes(launches, table.time, table.error, t1, until=limits, angle=angle, student=student)
 
 

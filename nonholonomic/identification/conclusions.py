@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..text import counted
 from .exploration import FARTHEST, ROWS, Explorer, Pool, fitted, squared_distances, weighted_covariance
 from .posterior import Coordinates, Matrix, Measurements, PerPoint, Points, Problem, deviances, predictions
 from .search import Minima, minimise
@@ -69,9 +70,12 @@ class Verdict(NamedTuple):
 
     def __str__(self) -> str:
         """Whether to believe the fit, and what to do; `Identification.details` has the statistics."""
-        if self.good:
-            return "no concerns about this fit"
-        return "do not rely on this fit yet: " + "; ".join(self.concerns)
+        notes = f", {counted(len(self.notes), 'note')} in its details" if self.notes else ""
+        return (
+            f"do not rely on this fit yet: {'; '.join(self.concerns)}"
+            if self.concerns
+            else f"no concerns about this fit{notes}"
+        )
 
 
 def judge(
@@ -118,8 +122,8 @@ def judge(
             (status != "converged", "the fit has not converged: allow more steps (max_steps), or start closer"),
             (
                 distribution.kind == "none",
-                "there are no errors and intervals, because the exploration ended early: start closer, give bounds or priors, "
-                "or fix numbers",
+                "there are no errors and intervals, because too few likely points were found: start closer, give bounds or "
+                "priors, or fix numbers",
             ),
             (len(minima) > 1, f"the data allow {len(minima)} minima: " + "; ".join(map(str, minima))),
             (missing, f"the model has no prediction for {missing} measurements: its run ends earlier, or fails"),

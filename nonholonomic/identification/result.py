@@ -31,6 +31,12 @@ from .search import SAME, FitWarning, Identifiability, Minima, identifiability, 
 
 # The result of a fit: estimates, errors, undetermined combinations, and the outcome of every start.
 
+#: The most likely value is stated where it is farther from the estimate than this part of a standard error.
+NOTICEABLE = 0.1
+
+#: Decimal places, or zeros before the point, beyond which a number is not written out.
+PLACES = 6
+
 #: Number of points of a curve, and the greatest number of predictions for each sample.
 POINTS, MOST = 1200, 16
 
@@ -210,7 +216,7 @@ class Identification:
 
     @status_line("drawing")
     def plot(self, unit: str | Sequence[str] | None = None) -> Any:
-        """Data and model, residuals, the distribution of every parameter with its estimate and 95 % interval, and the
+        """Data and model, residuals, the distributions of up to six parameters with estimates and 95 % intervals, and the
         correlations (needs matplotlib).
 
         **Arguments:** `unit`: unit to draw in, such as "deg" for all angles, or several, such as ("deg", "rpm").
@@ -243,7 +249,9 @@ class Identification:
             unit = readable_unit(self.units.get(name, "1"))
             interval = "undetermined" if np.isinf(self.standard_errors[name]) else "no interval"
             if np.isfinite(self.standard_errors[name]):
-                interval = f"95 %: {low} to {high}"
+                likely = self.most_likely[name]
+                differs = abs(likely - self.estimates[name]) > NOTICEABLE * self.standard_errors[name]
+                interval = f"95 %: {low} to {high}" + differs * f"; most likely {likely:.4g}"
             lines.append(f"  {name:{width}}  {' '.join(filter(None, (estimate, unit)))}  ({interval})")
         return "\n".join([*lines, f"verdict: {self.verdict}", "the statistics: print(fit.details)"])
 
@@ -254,17 +262,16 @@ class Identification:
         """
         numbers = factor * np.array([list(self.estimates.values())[self._place(name)], *self.interval(name)])
         reach = np.max(np.abs(numbers - numbers[0]))
-        # The place of the last digit, as a power of ten.
-        last = math.floor(math.log10(reach)) - 1 if 0.0 < reach < np.inf else -6
-        digits = np.floor(np.log10(np.maximum(np.abs(numbers), 10.0**last))) - last + 1.0
-        counts = np.fmin(np.fmax(digits, 1.0), 15.0).astype(int).tolist()
-        texts = (f"{number:#.{count}g}" for number, count in zip(numbers.tolist(), counts, strict=True))
-        estimate, low, high = (text.rstrip(".") for text in texts)
+        form, places = ".4g", 15
+        if 0.0 < reach < np.inf:
+            places = 1 - math.floor(math.log10(reach))
+            form = f".{max(places, 0)}f" if abs(places) <= PLACES else ".15g"
+        estimate, low, high = (f"{round(number, places) + 0.0:{form}}" for number in numbers.tolist())
         return estimate, low, high
 
     @property
     def details(self) -> str:
-        """The statistics of the fit: its verdict, estimates with standard errors, the combinations of parameters that the data
+        """The statistics behind the verdict, estimates with standard errors, the combinations of parameters that the data
         determine, and the residuals."""
         verdict, count = self.verdict, self.verdict.starts
         scatter = f"residuals this large have a probability of {verdict.p_value:.2g}"

@@ -99,7 +99,8 @@ def explore(
 
     ```
     """
-    return explore_model(drawn_by(model_of(system, start, None, input, jumps), draw), path, sliders, float(t1), unit)
+    model, unit = model_of(system, start, None, input, jumps), unit or getattr(start, "shown_in", None)
+    return explore_model(drawn_by(model, draw), path, sliders, float(t1), unit)
 
 
 def drawn_by(model: AbstractModel, draw: Draw) -> AbstractModel:

@@ -582,16 +582,19 @@ def _draw_distribution(fit: "Identification", name: str, axes: "Axes", unit: Uni
     points of the exploration."""
     shown, factor = in_unit(fit.units.get(name, "1"), unit)
     estimate, low, high = fit.rounded(name, factor)
-    ends, distribution = fit.interval(name, DEVIATIONS), fit.distribution
+    distribution = fit.distribution
     if distribution.kind == "weights":
         used = distribution.weights > 0.0
         values = fit.density.problem.unknowns.values(distribution.points[used])[:, list(fit.estimates).index(name)]
-        edges = (factor * np.linspace(*ends, BARS + 1)).tolist()
+        edges = (factor * np.linspace(*fit.interval(name, DEVIATIONS), BARS + 1)).tolist()
         axes.hist(factor * np.asarray(values), edges, weights=distribution.weights[used], color="C0", alpha=0.7)
     else:
-        deviations = np.linspace(-DEVIATIONS, DEVIATIONS, 101)
-        axes.plot(factor * np.linspace(*ends, 101), np.exp(-0.5 * deviations**2), color="C0")
-    axes.axvspan(*(factor * end for end in fit.interval(name)), color="0.92", zorder=0, label="95 %")
+        # Normal in the coordinate of the fit, which may be a logarithm.
+        deviations = np.linspace(0.0, DEVIATIONS, BARS)
+        below, above = np.array([fit.interval(name, deviation) for deviation in deviations]).T
+        heights = np.exp(-0.5 * deviations**2)
+        axes.plot(factor * np.append(below[::-1], above), np.append(heights[::-1], heights), color="C0")
+    axes.axvspan(*(factor * end for end in fit.interval(name)), color="0.92", zorder=0)
     axes.axvline(factor * fit.estimates[name], color="0.3", linewidth=1.0)
     axes.locator_params(axis="x", nbins=4)
     axes.set_ylim(0.0)

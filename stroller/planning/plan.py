@@ -544,7 +544,10 @@ def planned_stage(plan: Plan) -> Stage:
     ground, lines = ground_of([plan.run], stage.arena.normal, *feet), list(plan.candidates)
     ribbons = [ribbon(line, normals(np, problem.scene, line), RAISED * length, THIN * length) for line in lines]
     still = [("candidates", ribbons)]
-    blocks = [prism(foot, frame[3], HEIGHT * length) for foot, (_, frame) in zip(feet, problem.standing, strict=True)]
+    blocks = [
+        prism(foot, fixed(surface, tuple(frame[3])), HEIGHT * length)
+        for foot, (_, frame) in zip(feet, problem.standing, strict=True)
+    ]
     still += [("obstacles", blocks)] if blocks else []
     ends = goal_corners(problem, 2.0 * RAISED * length)
     pairs = (ends[:2], ends[2:]) if problem.goal.heading is None else (ends, np.roll(ends, -1, axis=0))

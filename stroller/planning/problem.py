@@ -77,7 +77,7 @@ class Box(Bounded):
 
     - `centre`: its middle, in the ground's coordinates, as the place of a `Launch`.
     - `size`: its lengths [m] along its own two axes, positive.
-    - `angle`: angle [rad] of its first axis, as the heading of a `Launch`.
+    - `angle`: angle [rad] of its first axis, seen from above from x towards y, otherwise as the heading of a `Launch`.
 
     **Raises:** `ValueError` for numbers out of range.
 

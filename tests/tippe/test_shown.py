@@ -1,16 +1,20 @@
 """Scenes and runs show themselves; numbers in another unit are suspected; a run goes to xarray, a file and a picture."""
 
+import copy
 import dataclasses
 import json
+import pickle
 import re
 import warnings
 
+import jax
 import numpy as np
 import pytest
 import xarray
 from close import assert_close
 from tops import rutstam_top
 
+import nonholonomic
 import tippe
 from tippe.__main__ import main
 
@@ -200,9 +204,16 @@ def test_a_launch_in_degrees_is_shown_in_degrees(run):
     assert in_degrees.portrait().axes[0].get_xlabel() == "inclination θ [deg]"
     assert "normal to axis [deg]" in in_degrees.view().html
     assert "normal to axis [deg]" in in_degrees.explore().html
-    several = tippe.InversionTimes([launch, tippe.Launch.degrees(8, 1500)], [5.0, 6.0], 0.1, t1=20.0).launch
-    assert_close(several.theta, np.radians([6.0, 8.0]), rtol=1e-15)
-    assert several.unit == launch.unit
+    several = tippe.InversionTimes([launch, tippe.Launch(0.1, 155.0)], [5.0, 6.0], 0.1, t1=20.0).launch
+    assert_close(several.theta, [np.radians(6.0), 0.1], rtol=1e-15)
+    for copied in (pickle.loads(pickle.dumps(launch)), copy.deepcopy(launch)):
+        assert repr(copied) == repr(tippe.Launch(launch.theta, launch.spin))
+    # Its structure is that of any launch; the numbers of a gradient are no angles.
+    assert jax.tree.structure(launch) == jax.tree.structure(tippe.Launch(0.1, 155.0))
+    assert repr(jax.grad(lambda launch: 2.0 * launch.spin)(launch)).startswith("Launch(theta=0 rad, spin=2 rad/s")
+    assert "velocity=(0.1, 0.2, 0.3) rad/s" in repr(tippe.Launch.degrees(6, 1500, angular_velocity=(0.1, 0.2, 0.3)))
+    assert nonholonomic.simulate(run.scene, launch, 1.0, tolerance=1e-6).unit == in_degrees.unit
+    assert "normal to axis [deg]" in nonholonomic.explore(run.scene, launch, t1=1.0).html
 
 
 def test_labels_are_what_differs(run):

@@ -84,8 +84,6 @@ class Launch(Bounded):
     - `velocity`: velocity of the sphere's centre, or of the centre of mass for other bodies, along (t1, t2), (2,)
       [m/s]; zero by default.
     - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), in addition to the spin about the axis; zero by default.
-    - `unit`: units in which texts, pictures and pages of the launch and its runs show numbers, as for `plot`; the numbers
-      themselves are in SI units.
 
     **Raises:** `ValueError` for numbers outside these ranges.
 
@@ -107,6 +105,10 @@ class Launch(Bounded):
     units |= {"place": "m or rad", "velocity": "m s-1", "angular_velocity": "rad s-1"}
     advice: ClassVar[dict[str, str]] = dict.fromkeys(("spin", "rpm"), SPINS)
 
+    #: The units in which texts, pictures and pages of a launch and its runs show numbers, if it was stated in them. Not a
+    #: field: neither the programs nor the gradients of a launch have units.
+    __slots__ = ("shown_in",)
+
     theta: Float[Array, "..."] = eqx.field(converter=as_number, metadata=INCLINATION)
     spin: Float[Array, "..."] = eqx.field(converter=as_number)
     eta: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=HALF_TURN)
@@ -122,7 +124,6 @@ class Launch(Bounded):
         default=None,
         kw_only=True,
     )
-    unit: tuple[str, ...] | None = eqx.field(static=True, default=None, kw_only=True)
 
     @classmethod
     @explaining
@@ -157,7 +158,13 @@ class Launch(Bounded):
         require(azimuth, "azimuth", why="in degrees")
         require(rpm, "rpm")
         theta, eta, azimuth = (jnp.radians(as_number(angle)) for angle in (theta, eta, azimuth))
-        return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **{"unit": IN_DEGREES} | others)
+        launch = cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others)
+        object.__setattr__(launch, "shown_in", IN_DEGREES)
+        return launch
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Copies are shown in SI units: pickle could not set the attribute of a frozen module.
+        return self.__dict__
 
     def suspicion(self) -> str | None:
         fastest = largest(self.spin)

@@ -124,10 +124,7 @@ class TopModel(AbstractSceneModel):
     """
 
     scene: Scene
-    # Without the unit of its texts, which no program needs.
-    launch: Launch = eqx.field(
-        converter=lambda launch: dataclasses.replace(launch, unit=None) if launch.unit else launch
-    )
+    launch: Launch
     angle: Any = None
     event: EventFunction | None = None
     reverses: bool = eqx.field(static=True, default=False)

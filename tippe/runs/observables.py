@@ -281,7 +281,7 @@ class AbstractTrajectory(AbstractRun):
 
     @property
     def unit(self) -> Unit:
-        return None if self.launch is None else self.launch.unit
+        return getattr(self.launch, "shown_in", None)
 
     @property
     def codes(self) -> Int[Array, "..."] | str | None:

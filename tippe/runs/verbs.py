@@ -1,6 +1,5 @@
 """The functions for launches of a top: single runs, inversion times, tables."""
 
-import dataclasses
 import math
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
@@ -582,8 +581,7 @@ def simulate(
     ```
     """
     check_run(scene, launch, t1, tolerance, "jax.vmap(simulate) takes lists, and so does trajectory_table")
-    run = simulate_launch(TopModel(scene=scene, launch=launch), t1, times, tolerance, solver, adjoint)
-    return run if launch.unit is None else dataclasses.replace(run, launch=launch)
+    return simulate_launch(TopModel(scene=scene, launch=launch), t1, times, tolerance, solver, adjoint)
 
 
 @status_line("simulating")

@@ -265,7 +265,9 @@ def explore(
     ```
     """
     check_run(scene, launch, t1, TOLERANCE)
-    return explore_model(TopModel(scene=scene, launch=launch), path, sliders, float(t1), unit or launch.unit)
+    return explore_model(
+        TopModel(scene=scene, launch=launch), path, sliders, float(t1), unit or getattr(launch, "shown_in", None)
+    )
 
 
 @page_of.register(TopModel)

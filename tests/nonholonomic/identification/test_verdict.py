@@ -204,9 +204,44 @@ def test_a_report_states_values_with_intervals_and_what_to_do_before_any_statist
     distance = max(abs(end - fit.estimates["rate"]) for end in fit.interval("rate"))
     assert abs(float(value) - fit.estimates["rate"]) <= 0.05 * distance
     assert len(value) <= 5
+    noted = dataclasses.replace(fit, verdict=fit.verdict._replace(notes=("a staircase",)))
+    assert "verdict: no concerns about this fit, 1 note in its details" in str(noted)
+    assert "note: a staircase" in noted.details
+    moved = fit.estimates["rate"] + 0.5 * fit.standard_errors["rate"]
+    apart = dataclasses.replace(fit, most_likely={**fit.most_likely, "rate": moved})
+    assert f"; most likely {moved:.4g})" in str(apart)
     doubtful = dataclasses.replace(fit, verdict=fit.verdict._replace(concerns=("start closer", "allow more steps")))
     assert "verdict: do not rely on this fit yet: start closer; allow more steps" in str(doubtful)
     assert doubtful.plot().get_suptitle() == "do not rely on this fit yet: start closer; allow more steps"
+
+
+@pytest.mark.parametrize(
+    ("numbers", "texts"),
+    [
+        ((5.94, 5.8746, 6.0046), ("5.940", "5.875", "6.005")),
+        ((150.0, 60.0, 350.0), ("150", "60", "350")),
+        ((8000.0, 7000.0, 9500.0), ("8000", "7000", "9500")),
+        ((123456.0, 122400.0, 124500.0), ("123500", "122400", "124500")),
+        ((0.0, -0.2, 0.3), ("0.00", "-0.20", "0.30")),
+        ((2.994e-6, 2.990e-6, 2.998e-6), ("2.994e-06", "2.99e-06", "2.998e-06")),
+        ((155.0, -math.inf, math.inf), ("155", "-inf", "inf")),
+        ((1.00312, math.nan, math.nan), ("1.003", "nan", "nan")),
+    ],
+)
+def test_values_are_rounded_to_two_digits_of_their_interval(numbers, texts, monkeypatch):
+    fit = identify(lambda p: p["x"][:, None], Measurements([2.0], 0.2), {"x": 0.5})
+    fit = dataclasses.replace(fit, estimates={"x": numbers[0]})
+    monkeypatch.setattr(type(fit), "interval", lambda self, name: numbers[1:])
+    assert fit.rounded("x") == texts
+
+
+def test_the_picture_of_a_normal_coordinate_peaks_at_the_estimate():
+    """The logarithm of a positive number is normal here; the errors are large."""
+    fit = identify(lambda p: jnp.log(p["x"])[:, None], Measurements([0.0], 0.3), {"x": Free(1.5, 0.0)})
+    assert fit.distribution.kind == "linear"
+    curve = fit.plot().axes[-1].lines[0]
+    assert_close(curve.get_xdata()[np.argmax(curve.get_ydata())], fit.estimates["x"], rtol=1e-12)
+    assert_close(np.diff(curve.get_xdata()) >= 0.0, True)
 
 
 def test_a_profile_says_where_it_found_a_better_fit():
