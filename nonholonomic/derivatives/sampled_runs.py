@@ -16,16 +16,7 @@ from ..integration.problem import LEFT_DOMAIN, event_time
 from ..validation import as_number
 from .adjoint import SampledCotangents, samples_pulled_back
 from .differentiable import AbstractDifferentiableSolve, Structure, differentiable_solve
-from .variation import (
-    Tangent,
-    Tangents,
-    VariationalProblem,
-    by_active,
-    in_groups,
-    probed,
-    tangent_along,
-    tangents_by,
-)
+from .variation import Tangent, Tangents, VariationalProblem, by_active, in_groups, probed, tangent_along, tangents_by
 
 # Samples of a run as a differentiable solve: its leaves, and how they are assembled into a problem.
 

@@ -43,15 +43,7 @@ from .ensemble import (
     selected_cells,
 )
 from .saltation import VariationalMode, along, delay, variational_modes, variational_start
-from .samples import (
-    Built,
-    Recorded,
-    output_rows,
-    reset_with_rows,
-    sampled_rounds,
-    sampled_with_tangents,
-    weighted,
-)
+from .samples import Built, Recorded, output_rows, reset_with_rows, sampled_rounds, sampled_with_tangents, weighted
 
 #: From some modules (scene, launch, ...), the tolerance and a number of cells to the modes, the index of the first mode
 #: of every cell, and the initial states.

@@ -361,12 +361,7 @@ def _first_losses(
 
 
 def follow(
-    problem: AbstractProblem,
-    t1: float,
-    settings: Settings,
-    *,
-    dense: bool = True,
-    piece: int = PIECE,
+    problem: AbstractProblem, t1: float, settings: Settings, *, dense: bool = True, piece: int = PIECE
 ) -> DenseSolution:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 

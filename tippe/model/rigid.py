@@ -44,15 +44,7 @@ from nonholonomic.text import shown
 from nonholonomic.validation import UNTRACEABLE, ArrayOrList, Bound, Bounded, as_number, is_traced
 
 from ..friction import AbstractFriction, ContactLoad, Slip
-from .dynamics import (
-    AXIS,
-    AbstractContactDynamics,
-    AbstractRollingDynamics,
-    Motion,
-    from_frame,
-    parts,
-    to_frame,
-)
+from .dynamics import AXIS, AbstractContactDynamics, AbstractRollingDynamics, Motion, from_frame, parts, to_frame
 
 # The inertia tensor of a rigid body, and symmetric matrices stored by their six components.
 

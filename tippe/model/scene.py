@@ -36,16 +36,7 @@ from nonholonomic.validation import Bound, Bounded, as_number, explaining, large
 
 from ..friction import A_LAW, AbstractFriction, Frictionless, NoSlip, SetValuedCoulomb, as_law
 from .body import AbstractBody, Top
-from .dynamics import (
-    TURNING,
-    Dynamics,
-    RollingDynamics,
-    from_frame,
-    inclination,
-    joined,
-    parts,
-    to_frame,
-)
+from .dynamics import TURNING, Dynamics, RollingDynamics, from_frame, inclination, joined, parts, to_frame
 from .rigid import AbstractRigidBody, RigidRolling, RigidSlipping, several
 from .stick_slip import StickSlip
 
