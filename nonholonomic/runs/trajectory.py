@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,9 +25,9 @@ from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
-from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Stage, Viewable, stages_of
+from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, Viewable, stages_of
 from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
-from ..views.stage import AbstractPart, Draw, curves_in, meshes_of, of_grid
+from ..views.stage import Draw, Drawing, Parts, Wheel, curves_in, meshes_of, of_grid
 from .model import AbstractModel, Names, Sliders, model_of, run_of
 
 # A page with sliders that simulates any model in the browser.
@@ -103,11 +103,11 @@ def explore(
     return explore_model(drawn_by(model, draw), path, sliders, float(t1), unit)
 
 
-def drawn_by(model: AbstractModel, draw: Draw) -> AbstractModel:
+def drawn_by(model: Any, draw: Draw) -> Any:
     """The model of your own system with a drawing; raises `ValueError` for another model."""
     if draw is None:
         return model
-    if not callable(draw) or "draw" not in (field.name for field in dataclasses.fields(model)):
+    if not callable(draw) or not hasattr(model, "draw"):
         raise ValueError(
             f"draw = {shown(draw)} must be a function draw(system, t, y) for your own system, and None for a scene"
         )
@@ -279,95 +279,119 @@ EQUAL = 4.0
 WIDTH, MARGIN, RISE = 0.03, 0.3, 0.7
 
 
-def point_of(runs: list["Trajectory"]) -> tuple[Callable[..., Any], np.ndarray, np.ndarray]:
-    """The function that draws a state as a point: `(state - centre) * scale`, with the centre and the scales."""
-    points = np.concatenate([np.stack([np.asarray(run[name]) for name in run.portrait_axes], axis=-1) for run in runs])
-    points = points[np.all(np.isfinite(points), axis=-1)]
+def drawing_of(model: Any, states: list[np.ndarray]) -> tuple[Drawing, str, str, tuple[tuple[str, float, float], ...]]:
+    """The function that draws the states of a model, the title, the name of the path, and the axes of the `Arena`.
+
+    By default, a state is a point in the plane of its first two components, or on a line if it has one component.
+    """
+    if model.draw:
+        return model.draw, model.title, "path", (("x [m]", 0.0, 1.0), ("y [m]", 0.0, 1.0))
+    points = np.pad(np.concatenate(states), ((0, 0), (0, 1)))[:, :2]
     low, span = points.min(axis=0), np.ptp(points, axis=0)
+    centre = low + 0.5 * span
     span = np.where(span > 0.0, span, np.max(span) or 1.0)
-    span = np.full(2, np.max(span)) if np.max(span) < EQUAL * np.min(span) else span
-    centre, scale = low + 0.5 * np.ptp(points, axis=0), 2.0 * HALF / span
+    scale = 2.0 * HALF / (np.full(2, np.max(span)) if np.max(span) < EQUAL * np.min(span) else span)
 
     def draw(system: object, t: Array, y: Array) -> list[Ball]:
-        return [Ball((*((y[min(k, len(y) - 1)] - centre[k]) * scale[k] for k in (0, 1)), RADIUS), RADIUS)]
+        x, y = ((part - middle) * by for part, middle, by in zip((*y, 0.0), centre, scale, strict=False))
+        return [Ball((x, y, RADIUS), RADIUS)]
 
-    return draw, centre, scale
+    names, path = model.names[:2], " over ".join(model.names[1::-1])
+    return draw, f"{model.title}: {path}", path, tuple(zip(names, centre.tolist(), scale.tolist(), strict=False))
 
 
-def frame_of(parts: Sequence[AbstractPart | Line], curves: tuple[Array, ...], turning_rate: Array) -> Frame[Array]:
-    """What is drawn of a state, or of those at many times: a body without meshes amid the parts, the parts, and the lines."""
-    solids = [part for part in parts if isinstance(part, AbstractPart)]
+def frame_of(draw: Drawing, system: object, t: Array, state: Array, rate: Any = 0.0) -> tuple[Parts, Array, Frame]:
+    """What is drawn of one state: the parts; their corners; and the frame, with a body without meshes amid the parts, the
+    parts, and the lines. **Arguments:** `rate`: greatest rotation rate of all parts [rad/s].
+
+    **Raises:** `ValueError` if `draw` fails or returns anything but a list of parts with numbers of the right shapes.
+    """
+    with named_errors("draw(system, t, y)", "the system, the time and the state"):
+        parts = draw(system, t, state)
+    if not isinstance(parts, list) or not parts or not all(isinstance(part, Box | Wheel | Line) for part in parts):
+        raise ValueError(f"draw must return a list of Box, Wheel, Disc, Ball and Line, not {shown(parts)}")
+    for part in parts:
+        kind, shapes = type(part).__name__, {name: np.shape(value) for name, value in vars(part).items()}
+        for name, shape in shapes.items():
+            is_vector = name in ("place", "lengths", "begin", "end")
+            if shape != ((3,) if is_vector else ()):
+                words = "three numbers, (x, y, z) in metres" if is_vector else "one number"
+                raise ValueError(f"draw: {name} in {kind} must be {words}, not of shape {shape}")
+    solids = [part for part in parts if isinstance(part, Box | Wheel)]
     lines = [part for part in parts if isinstance(part, Line)]
     points = [*(part.place for part in solids), *(end for line in lines for end in (line.end, line.begin))]
     middle = sum(points[1:], points[0]) / len(points)
-    zero, up = 0.0 * middle[..., 0], 0.0 * middle + np.array([0.0, 0.0, 1.0])
-    bodies = [(middle, jnp.concatenate([0.0 * middle, up[..., 2:]], axis=-1))]
+    bodies, corners = [(middle, jnp.array([0.0, 0.0, 0.0, 1.0]))], points.copy()
     for part in solids:
-        halves = [zero + 0.5 * jnp.asarray(angle) for angle in (part.heading, part.lean, part.spin)]
+        half = 0.5 * part.lengths if isinstance(part, Box) else part.radius
+        corners += [part.place - half, part.place + half]
+        halves = [0.5 * jnp.asarray(angle) for angle in (part.heading, part.lean, part.spin)]
         (c, d, e), (s, r, q) = map(jnp.cos, halves), map(jnp.sin, halves)
         # The quaternion (x, y, z, w) of the lean after the spin, then that of the heading after these.
         x, y, z, w = r * e, d * q, r * q, d * e
-        bodies.append((part.place, jnp.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z], axis=-1)))
+        bodies.append((part.place, jnp.stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])))
     arrows = tuple((line.begin, line.end - line.begin) for line in lines)
-    return Frame(up, tuple(bodies), ((points[0], None),), arrows, curves, turning_rate)
+    frame = Frame(jnp.array([0.0, 0.0, 1.0]), tuple(bodies), ((points[0], None),), arrows, tuple(state), rate)
+    return parts, jnp.stack(corners), frame
 
 
-def stage_of(numbers: Sequence[int], runs: list["Trajectory"]) -> tuple[Callable[..., Any], Stage]:
+def show_of(number: int, path: str, names: Sequence[str], size: float, drawn: tuple[np.ndarray, Parts, Frame]) -> Show:
+    """The drawing of a run. **Arguments:** `path`: name of its trace; `names`: those of its curves; `size`: that of the
+    drawing [m]; `drawn`: the times, the parts and the frames."""
+    (t, parts, frame), colour = drawn, COLOURS[number % len(COLOURS)]
+    solids = [part for part in parts if isinstance(part, Box | Wheel)]
+    for part in solids:
+        sizes = np.asarray(part.lengths if isinstance(part, Box) else part.radius)
+        if not np.allclose(sizes, sizes[:1]):
+            raise ValueError(f"draw: the size of a {type(part).__name__} must not change in time; its place may")
+    meshes = [(), *(meshes_of(part, colour) for part in jax.tree.map(lambda leaf: leaf[0], solids))]
+    poses = zip(frame.bodies, meshes, strict=True)
+    bodies = tuple(views.Body("part", place, orientation, mesh) for (place, orientation), mesh in poses)
+    lines = zip([part for part in parts if isinstance(part, Line)], frame.arrows, strict=True)
+    arrows = tuple(
+        views.Arrow("line", begin, vector, "", 1.0, line.colour, 0.5 * (line.width or WIDTH * size))
+        for line, (begin, vector) in lines
+    )
+    traces = (views.Trace(path, frame.traces[0][0], colour, WIDTH * size),)
+    curves = tuple(map(views.Curve, names, frame.curves))
+    return Show(f"run {number + 1}", colour, t, frame.normal, size, bodies, traces, arrows, curves)
+
+
+def stage_of(numbers: Sequence[int], runs: list["Trajectory"]) -> tuple[Drawing, Stage]:
     """The function that draws runs, and the stage that shows the first of them.
 
     **Arguments:** `numbers`: those of the runs that the stage shows; `runs`: these runs, and others for which the ground must
     have room.
+
+    **Raises:** `ValueError` for a batch of runs, a run without a finite state, and a function that draws NaN.
     """
+    models: list[Any] = [run.model for run in runs]
+    reached = []
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
-    models: list[Any] = [run.model for run in runs]
-    draw, centre, scale = (models[0].draw, np.zeros(2), np.ones(2)) if models[0].draw else point_of(runs)
-    names = ("x [m]", "y [m]") if models[0].draw else runs[0].portrait_axes
-    path = "path" if models[0].draw else " over ".join(names[::-1])
-    size, corners = 0.0 if models[0].draw else SIZE, []
-    drawn: list[tuple[Any, ...]] = []
-    for run, model in zip(runs, models, strict=True):
         is_reached = np.all(np.isfinite(np.asarray(run.state)), axis=-1)
-        t, state = np.asarray(run.t)[is_reached], np.asarray(run.state)[is_reached]
-        with named_errors("draw(system, t, y)", "the system, the time and the state"):
-            parts: Any = jax.vmap(functools.partial(draw, model.parameters.tree["system"]))(t, state)
-        if not isinstance(parts, list) or not parts or not all(isinstance(part, AbstractPart | Line) for part in parts):
-            raise ValueError(f"draw must return a list of Box, Wheel, Disc, Ball and Line, not {shown(parts)}")
-        for part in parts:
-            if isinstance(part, Line):
-                ends = [part.begin, part.end]
-            else:
-                half = 0.5 * part.lengths if isinstance(part, Box) else part.radius[:, None] * np.ones(3)
-                ends = [part.place - half, part.place + half] if part.place.shape[1:] == (3,) else [part.place]
-            if any(end.shape[1:] != (3,) for end in ends):
-                raise ValueError(f"draw: a place in {type(part).__name__} must be three numbers, (x, y, z) in metres")
-            corners += map(np.asarray, ends)
-        frame = jax.tree.map(np.asarray, frame_of(parts, tuple(state.T), jnp.asarray(t)))
-        sizes = [np.linalg.norm(end - frame.bodies[0][0], axis=-1) for end in corners[-2 * len(parts) :]]
-        size = max(size, float(np.max(sizes)))
-        drawn.append((t, frame, parts))
+        if not np.any(is_reached):
+            raise ValueError(f"a picture needs a finite state, but the run, with status {run.status!r}, has none")
+        reached.append((np.asarray(run.t)[is_reached], np.asarray(run.state)[is_reached]))
+    draw, title, path, axes = drawing_of(models[0], [state for _, state in reached])
+    size, corners, drawn = 0.0 if models[0].draw else SIZE, [], []
+    for model, (t, state) in zip(models, reached, strict=True):
+        draw_state = functools.partial(frame_of, draw, model.parameters.tree["system"])
+        parts, ends, frame = jax.tree.map(np.asarray, jax.vmap(draw_state)(t, state))
+        is_finite = np.all(np.isfinite(ends), axis=(1, 2))
+        if not np.all(is_finite):
+            raise ValueError(f"draw returned NaN or infinity at t = {t[np.argmin(is_finite)]:g}")
+        size = max(size, float(np.max(np.linalg.norm(ends - frame.bodies[0][0][:, None], axis=-1))))
+        corners.append(ends.reshape(-1, 3))
+        drawn.append((t, parts, frame))
+    size = size or 1.0
     low, high = (end(np.concatenate(corners), axis=0) for end in (np.min, np.max))
     low, high = np.append(low[:2] - MARGIN * size, min(0.0, low[2])), high + MARGIN * size
     ground = np.array([(x, y, low[2]) for x in (low[0], high[0]) for y in (low[1], high[1])])
-    axes = tuple(zip(names, centre.tolist(), scale.tolist(), strict=True))
-    arena = Arena(views.Mesh(ground, of_grid(2, 2)[:, ::-1], PALE), (), "", drawn[0][1].normal[0], axes)
-    shows = []
-    for number, run, (t, frame, parts) in zip(numbers, runs, drawn, strict=False):
-        colour, firsts = COLOURS[number % len(COLOURS)], jax.tree.map(lambda leaf: np.asarray(leaf)[0], parts)
-        meshes = [(), *(meshes_of(part, colour) for part in firsts if isinstance(part, AbstractPart))]
-        poses = zip(frame.bodies, meshes, strict=True)
-        bodies = tuple(views.Body("part", place, orientation, mesh) for (place, orientation), mesh in poses)
-        lines = zip([part for part in parts if isinstance(part, Line)], frame.arrows, strict=True)
-        arrows = tuple(
-            views.Arrow("line", begin, vector, "", 1.0, line.colour, 0.5 * (line.width or WIDTH * size))
-            for line, (begin, vector) in lines
-        )
-        traces = (views.Trace(path, frame.traces[0][0], colour, WIDTH * size),)
-        curves = tuple(map(views.Curve, run.names, frame.curves))
-        contents = (bodies, traces, arrows, curves)
-        shows.append(views.Show(f"run {number + 1}", colour, t, frame.normal, size, *contents))
-    title = models[0].title if models[0].draw else f"{models[0].title}: {path}"
-    return draw, Stage(title, arena, tuple(shows), rise=RISE)
+    arena = Arena(views.Mesh(ground, of_grid(2, 2)[:, ::-1], PALE), (), "", np.array([0.0, 0.0, 1.0]), axes)
+    shown_runs = zip(numbers, models, drawn, strict=False)
+    shows = tuple(show_of(number, path, model.names, size, of_run) for number, model, of_run in shown_runs)
+    return draw, Stage(title, arena, shows, rise=RISE)
 
 
 # One run of a user's system at given times.
@@ -408,7 +432,7 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
 
     def drawn_by(self, draw: Draw) -> Any:
         """The run with a drawing for its pictures; raises `ValueError` unless it is one of your own system."""
-        return dataclasses.replace(self, **{"model": drawn_by(self.of_page[0], draw)})
+        return dataclasses.replace(self, **{"model": drawn_by(getattr(self, "model", None), draw)})
 
     @status_line("reading off")
     def __str__(self) -> str:
@@ -457,6 +481,8 @@ class Trajectory(AbstractRun):
     ```
     """
 
+    readable: ClassVar[tuple[str, ...]] = ("state",)
+
     t: Float[Array, " times"]
     state: Float[Array, "times components"]
     mode: Int[Array, " times"]
@@ -485,7 +511,8 @@ class Trajectory(AbstractRun):
 
     @property
     def quantities(self) -> Mapping[str, Quantity]:
-        return self.model.quantities
+        # A copy has no model at first.
+        return self.model.quantities if "model" in vars(self) else {}
 
     @property
     def portrait_axes(self) -> tuple[str, str]:
@@ -577,9 +604,6 @@ class Trajectory(AbstractRun):
     def table_of(self, names: Sequence[str]) -> Table:
         """The table that pictures draw, with the states before and after each reset."""
         return self._with_resets().to_table()
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.names)
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         """Labels that tell runs apart by the numbers of their systems and starts that differ."""

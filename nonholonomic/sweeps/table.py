@@ -490,7 +490,7 @@ class Tabular(abc.ABC):
     ('time',)
     """
 
-    #: The names that a message for an unknown attribute lists; empty for the ordinary message.
+    #: The names that a message for an unknown attribute lists before the quantities; the ordinary message lists none.
     readable: ClassVar[tuple[str, ...]] = ()
 
     #: The units in which pictures show the numbers of the run, unless others are asked for.
@@ -619,7 +619,8 @@ class Tabular(abc.ABC):
     def __getattr__(self, name: str) -> Any:
         # Python calls this for unknown names, and for known names whose property raised an AttributeError, which is
         # raised again here.
-        readable = () if name.startswith("_") or hasattr(type(self), name) else self.readable or tuple(self.quantities)
+        is_known = name.startswith("_") or hasattr(type(self), name)
+        readable = () if is_known else dict.fromkeys((*self.readable, *self.quantities))
         if not readable:
             return object.__getattribute__(self, name)
         if name in self.quantities:

@@ -21,7 +21,7 @@ from ..parameters import Parameters, checks_of, require_apart, short_names
 from ..runs.event import UNMEASURED
 from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
-from ..runs.trajectory import TOLERANCE, frame_of, live_run, page_of, runs_at_ends, sliders_of, stage_of
+from ..runs.trajectory import TOLERANCE, Trajectory, frame_of, live_run, page_of, runs_at_ends, sliders_of, stage_of
 from ..sweeps import Axis, Quantity, Variable
 from ..text import name_of, shown
 from ..validation import as_number, is_traced
@@ -50,16 +50,16 @@ class OwnModel(AbstractModel):
     draw: Draw = eqx.field(static=True, default=None)
 
     @classmethod
-    def of(cls, tree: dict[str, Any]) -> "OwnModel":
-        """The model of a system, its start and its event."""
+    def of(cls, tree: dict[str, Any], draw: Draw = None) -> "OwnModel":
+        """The model of a system, its start, its event and its drawing."""
         hybrid, state = assembled(tree)
         form = Form.of(hybrid, state.size)[0]
         form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
-        return cls(parameters=Parameters.of(tree), form=form, names=names_of(tree["system"], form.size))
+        return cls(parameters=Parameters.of(tree), form=form, names=names_of(tree["system"], form.size), draw=draw)
 
-    def __reduce__(self) -> tuple[Function, tuple[dict[str, Any]]]:
+    def __reduce__(self) -> tuple[Function, tuple[dict[str, Any], Draw]]:
         # The structure of a tree with a user's classes cannot be pickled, but the tree can.
-        return OwnModel.of, (self.parameters.tree,)
+        return OwnModel.of, (self.parameters.tree, self.draw)
 
     def full_name(self, argument: str, name: str) -> str:
         return self.parameters.full_name(argument, name)
@@ -318,15 +318,16 @@ def _(
     return OwnModel.of({"system": system, "start": numbers, "event": event})
 
 
-#: Names of other columns of tables and trajectories.
-TAKEN = ("time", "status", "end_time", "steps", "rejected", "switches", "mode", "grazes")
+#: Names of other columns of tables, and of the attributes of a run.
+TAKEN = {"time", "grazes", *dir(Trajectory), *(field.name for field in dataclasses.fields(Trajectory))}
 
 
 def names_of(system: Hybrid | AbstractSystem, size: int) -> tuple[str, ...]:
     """The names of the components of a state: those of the system or of its first mode that has some, or `y0` and so on, or
     `q0` and `rate0` and so on for a mechanical system.
 
-    **Raises:** `ValueError` for a wrong number of names, names that are not different words, and names of other columns.
+    **Raises:** `ValueError` for a wrong number of names, names that are not different words, and names of other columns
+    and of attributes of a run.
     """
     modes = system.modes if isinstance(system, Hybrid) else (system,)
     mechanical = next((mode for mode in modes if isinstance(mode, AbstractSystem)), None)
@@ -337,14 +338,15 @@ def names_of(system: Hybrid | AbstractSystem, size: int) -> tuple[str, ...]:
     size = owner.dimension if has_rates else size
     if (names := owner.names) is None:
         return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(size))
+    words = ()
     if isinstance(names, tuple | list) and all(isinstance(name, str) and name.isidentifier() for name in names):
         words = (*names, *(f"{name}_rate" for name in names if has_rates))
         if len(names) == size and len(set(words)) == len(words) and set(words).isdisjoint(TAKEN):
             return words
     kind = "coordinate" if has_rates else "component of the state"
     raise ValueError(
-        f"{type(owner).__name__}.names = {shown(names)} must be {size} different words, one for each {kind}, and none of "
-        f"{', '.join(TAKEN)}"
+        f"{type(owner).__name__}.names = {shown(names)} must be {size} different words, one for each {kind}, and none that "
+        f"names anything else in a run or a table, such as {', '.join(sorted(TAKEN.intersection(words))) or 'time'}"
     )
 
 
@@ -374,11 +376,11 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
             result = jnp.where(failed, jnp.inf, model.components_of(ended.state[:, 0])[0])
         return model.ended(ended, TOLERANCE)[0], result[0]
 
-    def frame(model: OwnModel, time: object, rows: Array, mode: object) -> Frame:
+    def frame(model: OwnModel, time: Array, rows: Array, mode: object) -> Frame:
         components = model.components_of(rows[:, 0])
         rate = jnp.asarray(2.0 * np.pi * TURNS / t1) + 0.0 * components[0]
-        parts = draw(model.parameters.tree["system"], time, components)
-        return frame_of(parts, tuple(components), rate)
+        # The time has an axis of one run.
+        return frame_of(draw, model.parameters.tree["system"], jnp.reshape(time, ()), components, rate)[-1]
 
     live = live_run(
         model,

@@ -375,7 +375,8 @@ class Viewable:
         - `overlaid`: whether to draw all runs in the arena of the first, instead of side by side.
         - `unit`: unit of the curves and of the names of the runs, as for `plot`, such as ("deg", "rpm").
         - `draw`: for your own system, a function `draw(system, t, y)` that returns a list of `views.Box`, `Wheel`, `Disc`,
-          `Ball` and `Line`; the first part leaves a trace. By default, the first two components of the state are a path.
+          `Ball` and `Line`, of sizes that do not change in time; the first part leaves a trace. By default, the first two
+          components of the state are a path.
 
         **Returns:** a `Page`, with its `html`.
 
@@ -458,8 +459,9 @@ class Viewable:
     def _stages(self, others: Sequence[Any], overlaid: bool, unit: Unit, draw: Draw) -> list[Stage]:
         """The stages in a unit, after a check of the unit and that the others are runs of the same package."""
         require_unit(unit)
-        others, run, unit = require_others(self, others), cast(Any, self), unit or self.unit
-        return curves_in((run if draw is None else run.drawn_by(draw)).stages(others, overlaid, unit), unit)
+        runs, unit = [cast(Any, self), *require_others(self, others)], unit or self.unit
+        runs = runs if draw is None else [run.drawn_by(draw) for run in runs]
+        return curves_in(stages_of(runs[0], runs, overlaid, unit), unit)
 
 
 def require_others(run: object, others: Any) -> Sequence[Any]:

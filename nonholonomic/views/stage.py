@@ -17,8 +17,10 @@ from ..text import Unit, in_unit, require_unit_of
 
 Points = Float[np.ndarray, "times 3"]
 
-#: A function of your own system, the time and the state that returns the parts of its drawing, or `None` for a default.
-Draw = Callable[..., Sequence["AbstractPart | Line"]] | None
+#: The parts of a drawing, and a function of your own system, the time and the state that returns them, or `None` for a default.
+Parts = Sequence["AbstractPart | Line"]
+Drawing = Callable[..., Parts]
+Draw = Drawing | None
 
 
 class Mesh(NamedTuple):
@@ -230,11 +232,11 @@ def rod(radius: float, begin: float, end: float, knob: float, colour: int) -> Me
     return revolved([*cap, (radius, begin)], colour)
 
 
-def box(lengths: tuple[float, float, float], centre: tuple[float, float, float], colour: int) -> Mesh:
+def box(lengths: ArrayLike | tuple[float, float, float], centre: tuple[float, float, float], colour: int) -> Mesh:
     """A box with edges along the axes [m]."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    vertices = np.concatenate([corners[list(side)] for side in sides]) * lengths + np.asarray(centre)
+    vertices = np.concatenate([corners[list(side)] for side in sides]) * np.asarray(lengths) + np.asarray(centre)
     triangles = np.concatenate([[[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]] for k in range(6)])
     return Mesh(vertices, triangles, colour)
 
@@ -267,7 +269,8 @@ def wheel(radius: float, width: float, colours: tuple[int, int]) -> tuple[Mesh, 
 
 class AbstractPart(eqx.Module):
     """A rigid part of a drawing, with its middle at `place` [m]: first it spins about the y axis, then it leans about the x
-    axis, then it turns to its heading about the z axis [rad]; `colour`: 0xrrggbb, by default that of the run."""
+    axis, then it turns to its heading about the z axis [rad]; `colour`: 0xrrggbb, by default that of the run, but dark for a
+    `Wheel`."""
 
     place: Float[Array, "*times 3"] = eqx.field(converter=jnp.asarray)
     heading: Float[ArrayLike, "*times"] = eqx.field(default=0.0, kw_only=True)
@@ -291,13 +294,14 @@ class Box(AbstractPart):
 
 
 class Wheel(AbstractPart):
-    """A wheel of a `radius` [m] about its own y axis, with spokes that show its `spin`; the rest as for `Box`."""
+    """A wheel of a `radius` [m] about its own y axis, with spokes that show its `spin`, dark by default; the rest as for
+    `Box`."""
 
     radius: Float[ArrayLike, "*times"]
 
 
 class Disc(Wheel):
-    """A thin disc of a `radius` [m] about its own y axis; the rest as for `Box`."""
+    """A thin disc of a `radius` [m] about its own y axis, in the colour of the run by default; the rest as for `Box`."""
 
 
 class Ball(Wheel):
@@ -305,7 +309,8 @@ class Ball(Wheel):
 
 
 class Line(eqx.Module):
-    """A line between two moving points [m], such as a rod or a spring; `width` [m], by default a part of the drawing."""
+    """A line between two moving points [m], such as a rod or a spring; `width` [m], by default 3 % of the size of the
+    drawing; `colour`: 0xrrggbb, dark by default."""
 
     begin: Float[Array, "*times 3"] = eqx.field(converter=jnp.asarray)
     end: Float[Array, "*times 3"] = eqx.field(converter=jnp.asarray)
@@ -317,8 +322,7 @@ def meshes_of(part: Any, colour: int) -> tuple[Mesh, ...]:
     """The meshes of a rigid part at one time. **Arguments:** `colour`: that of the run."""
     colour = colour if part.colour is None else part.colour
     if isinstance(part, Box):
-        length, width, height = map(float, part.lengths)
-        return (box((length, width, height), (0.0, 0.0, 0.0), colour),)
+        return (box(part.lengths, (0.0, 0.0, 0.0), colour),)
     radius = float(part.radius)
     if isinstance(part, Ball):
         return ball(radius, (colour, PALE))

@@ -332,7 +332,6 @@ class Trajectory(AbstractRun):
     spec: RideSpec
     steps: Steps | None
 
-    readable: ClassVar[tuple[str, ...]] = tuple(QUANTITIES)
     quantities: ClassVar[dict[str, Quantity]] = QUANTITIES
     portrait_axes = ("steering", "yaw_rate")
 

@@ -1,5 +1,9 @@
 """Drawings of own systems in pages: a path of the first two components, or parts."""
 
+import copy
+import pickle
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,9 +12,9 @@ from own_modes import Sleigh
 from scipy.spatial.transform import Rotation
 
 import nonholonomic
-from nonholonomic import AbstractSystem, Hybrid, simulate
+from nonholonomic import AbstractMode, AbstractSystem, Hybrid, simulate
 from nonholonomic.runs import model_of
-from nonholonomic.runs.trajectory import drawn_by, page_of
+from nonholonomic.runs.trajectory import Trajectory, drawn_by, page_of
 from nonholonomic.views import Ball, Box, Disc, Line, Wheel
 
 SLEIGH = ([0.0, 0.0, 0.3], [0.5 * np.cos(0.3), 0.5 * np.sin(0.3), 2.0])
@@ -119,11 +123,102 @@ def test_runs_overlaid_have_colours_of_their_own():
             lambda system, t, y: [y[7] + system.mass],
             r"draw\(system, t, y\) raised AttributeError: .*no attribute 'mass'",
         ),
-        (lambda system, t, y: [Ball((y[0], 0.0), 0.1)], r"draw: a place in Ball must be three numbers, \(x, y, z\)"),
-        (lambda system, t, y: [Line((0.0, 0.0), (1.0, 0.0))], "draw: a place in Line must be three numbers"),
+        (lambda system, t, y: [Ball((y[0], 0.0), 0.1)], r"draw: place in Ball must be three numbers, \(x, y, z\)"),
+        (lambda system, t, y: [Line((0.0, 0.0), (1.0, 0.0))], "draw: begin in Line must be three numbers"),
+        (
+            lambda system, t, y: [Ball((y[0], 0.0, jnp.sqrt(0.1 - t)), 0.1)],
+            r"draw returned NaN or infinity at t = 0\.1",
+        ),
+        (lambda system, t, y: [Ball((0.0, 0.0, 0.0), jnp.nan * t)], r"draw returned NaN or infinity at t = 0"),
+        (lambda system, t, y: [Ball((0.0, 0.0, 0.0), 0.1 + t)], "draw: the size of a Ball must not change in time"),
+        (
+            lambda system, t, y: [Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0 + t))],
+            "draw: the size of a Box must not change in time",
+        ),
+        (lambda system, t, y: [Wheel((0.0, 0.0, 0.0), y)], r"radius in Wheel must be one number, not of shape \(2,\)"),
+        (lambda system, t, y: [Disc((0.0, 0.0, 0.0), 0.1, spin=y)], r"spin in Disc must be one number, not of shape"),
+        (
+            lambda system, t, y: [Box((0.0, 0.0, 0.0), 1.0)],
+            r"lengths in Box must be three numbers, .*not of shape \(\)",
+        ),
         ("red", r"draw = 'red' must be a function draw\(system, t, y\) for your own system"),
     ],
 )
 def test_wrong_drawings_are_refused(draw, problem):
     with pytest.raises(ValueError, match=problem):
         simulate(Pendulum(), ([1.0], [0.0]), 0.2).view(draw=draw)
+
+
+def rising(system, t, y):
+    return [Ball((0.0, 0.1 * t, t), 0.1), Line((0.0, 0.0, 0.0), (0.0, 0.0, t))]
+
+
+def test_places_may_depend_on_time_in_pages_with_sliders():
+    run = simulate(Pendulum(), ([1.0], [0.0]), 0.5)
+    assert "Pendulum" in run.explore(sliders={"length": (0.5, 2.0)}, draw=rising).html
+    (show,) = run.drawn_by(rising).stages()[0].shows
+    np.testing.assert_allclose(show.bodies[1].position[:, 2], run.t)
+
+
+def test_what_a_drawing_lacks_is_said_in_pages_with_sliders():
+    with pytest.raises(ValueError, match="draw: place in Ball must be three numbers"):
+        nonholonomic.explore(Pendulum(), ([1.0], [0.0]), t1=0.5, draw=lambda system, t, y: [Ball((y[0], 0.0), 0.1)])
+
+
+def test_runs_side_by_side_are_all_drawn_by_the_function():
+    runs = [simulate(Pendulum(length), ([1.0], [0.0]), 0.5) for length in (1.0, 2.0)]
+    stages = runs[0]._stages([runs[1]], False, None, pendulum)
+    assert [stage.title for stage in stages] == ["Pendulum", "Pendulum"]
+    assert [len(stage.shows[0].arrows) for stage in stages] == [1, 1]
+
+
+def test_a_batch_of_runs_is_refused_also_with_a_drawing():
+    runs = jax.vmap(lambda angle: simulate(Pendulum(), (angle, jnp.zeros(1)), 0.5, times=[0.1]))(jnp.ones((2, 1)))
+    with pytest.raises(ValueError, match="this is a batch of runs"):
+        runs.view(draw=pendulum)
+
+
+def test_a_run_without_a_finite_state_has_no_picture():
+    illegal = jax.vmap(lambda height: simulate(Hybrid([Bouncing()]), [height, 0.0, 0.0], 0.5, times=[0.1]))(
+        -jnp.ones(1)
+    )
+    run = jax.tree.map(lambda leaf: leaf[0], illegal)
+    with pytest.raises(ValueError, match="needs a finite state, but the run, with status 'illegal', has none"):
+        run.view()
+
+
+class Decay(AbstractMode):
+    def field(self, t, y):
+        return -y
+
+
+def test_one_component_is_drawn_on_a_line():
+    (stage,) = simulate(Hybrid([Decay()]), [1.0], 1.0).stages()
+    assert (stage.title, [name for name, _, _ in stage.arena.axes]) == ("Decay: y0", ["y0"])
+    points = stage.shows[0].traces[0].points
+    np.testing.assert_allclose((points[0], points[-1]), [[1.0, 0.0, 0.04], [-1.0, 0.0, 0.04]])
+
+
+def test_a_drawing_without_extent_has_a_size():
+    run = simulate(Hybrid([Decay()]), [1.0], 1.0).drawn_by(lambda system, t, y: [Ball((0.0, 0.0, 0.0), 0.0)])
+    assert run.stages()[0].shows[0].size == 1.0
+
+
+def test_copies_keep_the_drawing():
+    run = simulate(Pendulum(), ([1.0], [0.0]), 0.5).drawn_by(pendulum)
+    assert copy.deepcopy(run).model.draw is pickle.loads(pickle.dumps(run)).model.draw is pendulum
+    assert not hasattr(object.__new__(Trajectory), "model")
+
+
+def test_an_unknown_attribute_lists_the_state():
+    run = simulate(Pendulum(), ([1.0], [0.0]), 0.5)
+    with pytest.raises(AttributeError, match=r"no 'stat'; did you mean 'stat(e|us)'\? It has t, state, q0, rate0"):
+        run.stat  # noqa: B018
+    assert list(run) == ["q0", "rate0"]
+
+
+@pytest.mark.parametrize("name", ["unit", "state", "model", "plot", "time", "end_time"])
+def test_components_have_no_names_of_a_run(name):
+    wrong = type("Wrong", (Decay,), {"names": (name,)})
+    with pytest.raises(ValueError, match=rf"Wrong\.names = .* must be 1 different words, .*, such as {name}"):
+        simulate(Hybrid([wrong()]), [1.0], 1.0)
