@@ -62,24 +62,25 @@ def table_path(path: object) -> Path:
     """
     file = as_path(path, "path")
     if file.suffix.lower() in OTHER_FORMATS:
-        raise ValueError(
-            f"path = {str(path)!r} must end in .h5: the file is in HDF5; for a CSV or Excel file, use to_dataframe().to_csv or "
-            ".to_excel"
-        )
+        advice = "for a CSV or Excel file, use to_dataframe().to_csv or .to_excel"
+        raise ValueError(f"path = {str(path)!r} must end in .h5: the file is in HDF5; {advice}")
     return file
 
 
-def write_file(path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values]]]) -> None:
+def write_file(path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values] | None]]) -> None:
     """Write a table completely or not at all; an existing file is replaced.
 
-    **Arguments:** `chunks`: the index of a chunk and its cells by variable, in any order; other chunks stay unfinished.
+    **Arguments:** `chunks`: the index of a chunk and its cells by variable, in any order; other chunks, and those with
+    `None`, stay unfinished.
 
-    **Raises:** `OSError` that names the path if it cannot be written.
+    **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for words that a file cannot hold.
     """
     with replacing(path) as scratch, Stream(scratch, "r+b") as stream:
         places = _describe(stream, layout)
         for chunk, values in chunks:
-            write_chunk(stream, layout, places, chunk, values)
+            if values is not None:
+                write_chunk(stream, layout, places, chunk, values)
+                stream.check()
 
 
 def write_chunk(
@@ -90,15 +91,21 @@ def write_chunk(
     values: dict[str, Values],
     synced: bool = False,
 ) -> None:
-    """Write the numbers of a chunk and their checksums, and mark it as finished when they are on disk.
+    """Write the numbers of a chunk and their checksums, and mark it as finished when they are on disk; the caller checks
+    the stream for the mark.
 
     **Arguments:** `places`: where the file has the numbers of its arrays; `synced`: whether to wait for the disk.
 
-    **Raises:** `OSError` if that fails.
+    **Raises:** `OSError` if that fails; `ValueError`, before anything is written, if a variable has the wrong shape.
     """
-    first, _ = layout.ends(chunk)
-    for name, kind in layout.kinds.items():
-        cells = np.ascontiguousarray(values[name], kind)
+    first, end = layout.ends(chunk)
+    variables = {name: np.ascontiguousarray(values[name], kind) for name, kind in layout.kinds.items()}
+    for name, cells in variables.items():
+        # Longer data would overwrite other chunks and the description of the file.
+        shape = (end - first, *layout.inner_shape(name))
+        if cells.shape != shape:
+            raise ValueError(f"{name} of cells {first} to {end - 1} must have the shape {shape}, not {cells.shape}")
+    for name, cells in variables.items():
         stream.seek(places[name] + layout.bytes_of_cells(first, name))
         stream.write(cells.tobytes())
         stream.seek(places[f"{CHECKSUMS}/{name}"] + 4 * chunk)
@@ -106,7 +113,6 @@ def write_chunk(
     stream.check(synced)
     stream.seek(places[f"{CHECKSUMS}/{FINISHED}"] + chunk)
     stream.write(b"\xff")
-    stream.check(synced)
 
 
 class Stream(io.FileIO):
@@ -169,7 +175,10 @@ def _describe(stream: Stream, layout: Layout) -> dict[str, int]:
         for name in (*layout.coords, *layout.kinds):
             if name in meanings:
                 file[name].attrs["flag_values"] = np.arange(len(meanings[name]), dtype=np.int8)
-                _set(file[name], "flag_meanings", " ".join(meanings[name]))
+                text = " ".join(meanings[name])
+                if text.split() != list(meanings[name]):
+                    raise ValueError(f"the words of {name} must not have spaces or be empty: {meanings[name]}")
+                _set(file[name], "flag_meanings", text)
             else:
                 _set(file[name], "units", layout.units.get(name, "1"))
             if name in layout.long_names:
@@ -221,31 +230,32 @@ class Stored(Mapping[str, Values]):
     `path`: the file; `layout`: its contents; `places`: where its numbers are; `finished`: the finished chunks.
     """
 
-    def __init__(self, path: Path):
-        """Open a file and read its layout.
+    def __init__(self, path: Path, is_unfinished: bool = False):
+        """Open the file of a table, or of an unfinished table, and read its layout.
 
-        **Raises:** `OSError` that names the path if it cannot be read or holds no table.
+        **Raises:** `OSError` that names the path of the table if it cannot be read or holds no table.
         """
         # The import takes a tenth of a second, and most processes do not need it.
         import h5py
 
-        if not path.exists():
+        self.path = folder_of(path) / UNFINISHED if is_unfinished else path
+        self._title = f"{path}, unfinished in {folder_of(path)}" if is_unfinished else f"{path}"
+        if not self.path.exists():
             raise FileNotFoundError(f"no such file: {path}")
-        if path.is_dir():
-            raise OSError(f"cannot read {path}: it is a folder")
-        self.path = path
+        if self.path.is_dir():
+            raise OSError(f"cannot read {self._title}: it is a folder")
+        reason = "it is not a table of nonholonomic, or it is damaged"
         try:
-            with h5py.File(path, "r") as file:
+            with h5py.File(self.path, "r") as file:
+                if is_unfinished and FINISHED not in cast("h5py.Group", file[CHECKSUMS]):
+                    reason = "an earlier version began this table; resume with that version, or remove the folder"
                 self.layout, self._sums, self.places = _contents(file)
         # What a damaged file makes HDF5 and NumPy raise can be of any kind.
         except Exception as error:
-            reason = f"it is not a table of nonholonomic, or it is damaged ({error or type(error).__name__})"
-            raise OSError(f"cannot read {path}: {reason}") from None
+            raise OSError(f"cannot read {self._title}: {reason} ({error or type(error).__name__})") from None
         self.finished = set(np.flatnonzero(self._sums[FINISHED]).tolist())
 
     def __getitem__(self, name: str) -> Values:
-        if name not in self:
-            raise KeyError(name)
         return self.layout.shaped(name, self.whole(name))
 
     # Of a `Mapping`, it would read the numbers.
@@ -272,14 +282,17 @@ class Stored(Mapping[str, Values]):
                 part[...] = self.layout.empty(1)[name]
         if damaged:
             reason = f"{damaged} of its {self.layout.chunks} chunks do not match their checksums"
-            raise OSError(f"cannot read {self.path}: it is damaged: {reason}")
+            raise OSError(f"cannot read {self._title}: it is damaged: {reason}")
         if name in self.layout.words and np.any((values < PENDING) | (values >= len(self.layout.words[name]))):
-            raise OSError(f"cannot read {self.path}: it is damaged: {name} has codes without a word")
+            raise OSError(f"cannot read {self._title}: it is damaged: {name} has codes without a word")
         return values
 
     def chunk(self, chunk: int) -> dict[str, Values] | None:
-        """The variables of one chunk; `None` if its numbers do not match their checksums."""
-        variables = {name: self._cells(name, *self.layout.ends(chunk)) for name in self.layout.kinds}
+        """The variables of one chunk; `None` if its numbers cannot be read or do not match their checksums."""
+        try:
+            variables = {name: self._cells(name, *self.layout.ends(chunk)) for name in self.layout.kinds}
+        except OSError:
+            return None
         are_right = all(zlib.crc32(values.data) == self._sums[name][chunk] for name, values in variables.items())
         return variables if are_right else None
 
@@ -289,7 +302,7 @@ class Stored(Mapping[str, Values]):
         try:
             return np.fromfile(self.path, self.layout.kinds[name], math.prod(shape), offset=place).reshape(shape)
         except (OSError, ValueError) as error:
-            raise OSError(f"cannot read {self.path}: {error}") from None
+            raise OSError(f"cannot read {self._title}: {error}") from None
 
 
 def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values], dict[str, int]]:
@@ -303,7 +316,8 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values], dict[str, i
             raise ValueError(f"the attribute {name} is not a dictionary")
     axes, checksums = json.loads(attributes["axes"]), cast("h5py.Group", file[CHECKSUMS])
     places = _places(file)
-    sums = {name: np.asarray(checksums[name]) for name in map(str, checksums)}
+    # The marks first: a sweep may finish a chunk meanwhile, which would then have its new mark and its old checksum.
+    sums = {name: np.asarray(checksums[name]) for name in sorted(checksums, key=lambda name: name != FINISHED)}
     for name in (*axes, *(name for name in map(str, file) if name not in (*axes, CHECKSUMS))):
         array = cast("h5py.Dataset", file[name])
         if "long_name" in array.attrs:
@@ -311,9 +325,8 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values], dict[str, i
         if "flag_meanings" in array.attrs:
             meanings = _attribute(array, "flag_meanings", is_text=True).split()
             # Words of earlier versions are converted to current ones.
-            words[name] = (
-                tuple(FORMER_WORDS.get(word, word) for word in meanings) if name == "status" else tuple(meanings)
-            )
+            former = FORMER_WORDS if name == "status" else {}
+            words[name] = tuple(former.get(word, word) for word in meanings)
         else:
             units[name] = _attribute(array, "units", is_text=True)
         if array.is_scale:
@@ -379,7 +392,7 @@ class ChunkStore:
     A chunk counts as finished only when it is complete and on disk. It then survives if the process dies, or if the
     machine dies and its disk keeps confirmed data.
 
-    `finished`: the indices of the chunks that existed when the sweep began.
+    `finished`: the indices of the finished chunks.
     """
 
     def __init__(self, path: object, layout: Layout):
@@ -402,42 +415,44 @@ class ChunkStore:
         for file in list(self.folder.iterdir()):
             if PART.fullmatch(file.name):
                 file.unlink()
-        tables = [Stored(file) for file in (self._unfinished, self.path) if file.exists()]
-        for table in tables:
+        tables: list[Stored] = []
+        self.finished, self._is_whole = set(), False
+        for is_unfinished in (False, True):
+            if not (self._unfinished if is_unfinished else self.path).exists():
+                continue
+            table = Stored(self.path, is_unfinished)
             difference = difference_between(table.layout, self.layout)
             if difference is not None:
-                raise AnotherRun(self.path if table.path == self.path else self.folder, difference)
-            old, new = table.layout.versions, self.layout.versions
+                raise AnotherRun(self.folder if is_unfinished else self.path, difference)
+            self.finished |= {chunk for chunk in table.finished if table.chunk(chunk) is not None}
+            tables.append(table)
+            self._is_whole = not is_unfinished and len(self.finished) == self.layout.chunks
+            if self._is_whole:
+                return
+        if tables:
+            old, new = tables[0].layout.versions, self.layout.versions
             changed = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
             if changed and not self.path.exists():
                 versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
                 warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning)
-        if tables:
             # The table records the versions with which it was begun.
-            self.layout = tables[-1].layout
-        valid = [{chunk for chunk in table.finished if table.chunk(chunk) is not None} for table in tables]
-        self.finished = set().union(*valid)
-        self._is_whole = self.path.exists() and len(valid[-1]) == self.layout.chunks
-        if self._is_whole:
-            return
+            self.layout = tables[0].layout
         if [table.path for table in tables] != [self._unfinished]:
             self._begin(tables)
-        self._places = Stored(self._unfinished).places
+        unfinished = Stored(self.path, is_unfinished=True)
+        # A chunk that could be read only the first time is not in a new file.
+        self._places, self.finished = unfinished.places, self.finished & unfinished.finished
         damaged = {chunk for table in tables for chunk in table.finished} - self.finished
         if damaged:
-            warn(
-                f"{self.path} is damaged: {len(damaged)} finished chunks do not match their checksums and are computed again",
-                RuntimeWarning,
-            )
+            reason = f"{len(damaged)} finished chunks do not match their checksums, or are unreadable, and are computed again"
+            warn(f"{self.path} is damaged: {reason}", RuntimeWarning)
 
     def _begin(self, tables: list[Stored]) -> None:
         """Create the file of the chunks, with those of other files, unless its folder is somebody else's."""
         foreign = [file.name for file in self.folder.iterdir() if file.name not in (LOCK, UNFINISHED)]
         if foreign and not self._unfinished.exists():
-            raise OSError(
-                f"cannot write {self.path}: the folder of its chunks, {self.folder}, holds other files, such as {foreign[0]}; "
-                "give another path, or move them"
-            )
+            folder = f"the folder of its chunks, {self.folder}, holds other files, such as {foreign[0]}"
+            raise OSError(f"cannot write {self.path}: {folder}; give another path, or move them")
         bytes_needed = self.layout.bytes_of_cells(self.layout.cells)
         try:
             room = shutil.disk_usage(self.folder).free
@@ -447,12 +462,7 @@ class ChunkStore:
         if room < bytes_needed:
             sizes = f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * bytes_needed:.3g} GB"
             raise OSError(f"cannot write {self.path}: {sizes}")
-        chunks = (
-            (chunk, values)
-            for table in tables
-            for chunk in table.finished
-            if (values := table.chunk(chunk)) is not None
-        )
+        chunks = ((chunk, table.chunk(chunk)) for table in tables for chunk in table.finished)
         write_file(self._unfinished, self.layout, chunks)
 
     def fill(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> None:
@@ -461,7 +471,6 @@ class ChunkStore:
         **Raises:** `OSError` that names the path if it cannot be written; no chunk is lost.
         """
         if self._is_whole:
-            self._unfinished.unlink(missing_ok=True)
             return
         for chunk, values in computed:
             self.write(chunk, values)
@@ -475,17 +484,23 @@ class ChunkStore:
     def write(self, chunk: int, values: dict[str, Values]) -> None:
         """Store a chunk.
 
-        **Raises:** `OSError` that names the path if that fails; earlier chunks remain finished.
+        **Raises:** `OSError` that names the path if that fails, `ValueError` if a variable has the wrong shape; earlier
+        chunks remain finished.
         """
         try:
             with Stream(self._unfinished, "r+b") as stream:
                 write_chunk(stream, self.layout, self._places, chunk, values, synced=True)
+                # Before waiting for the disk: from here on, the chunk survives the process, also if Ctrl-C ends it.
+                self.finished.add(chunk)
+                stream.check(synced=True)
+        except ValueError as error:
+            raise ValueError(f"cannot write {self.path}: {error}") from None
         except OSError as error:
             raise OSError(f"cannot write {self.path}: {error.strerror}") from None
 
     def interrupted(self) -> str:
         """Message after Ctrl-C: what is saved, and how to resume."""
-        saved, total = with_spaces(saved_cells(self.path)), with_spaces(self.layout.cells)
+        saved, total = (with_spaces(n) for n in (sum(map(self.layout.size, self.finished)), self.layout.cells))
         return f"saved {saved} of {total} cells to {self.path}; run the same call again to resume"
 
     def _locked(self) -> IO[bytes] | None:
@@ -547,11 +562,10 @@ def saved_cells(path: Path) -> int:
     >>> saved_cells(Path("none.h5"))
     0
     """
-    unfinished = folder_of(path) / UNFINISHED
-    file = unfinished if unfinished.exists() else path
-    if not file.exists():
+    is_unfinished = not path.exists()
+    if is_unfinished and not (folder_of(path) / UNFINISHED).exists():
         return 0
-    table = Stored(file)
+    table = Stored(path, is_unfinished)
     return sum(map(table.layout.size, table.finished))
 
 
@@ -561,10 +575,9 @@ def contents_of(path: Path) -> tuple[Layout, Mapping[str, Values]]:
 
     **Raises:** `OSError` that names the path if it cannot be read, holds no table, or has a damaged chunk.
     """
-    unfinished = folder_of(path) / UNFINISHED
-    is_unfinished = not path.exists() and unfinished.exists()
+    is_unfinished = not path.exists() and (folder_of(path) / UNFINISHED).exists()
     try:
-        stored = Stored(unfinished if is_unfinished else path)
+        stored = Stored(path, is_unfinished)
         layout = stored.layout
         if not is_unfinished and layout.bytes_of_cells(layout.cells) > MAX_BYTES_IN_MEMORY:
             return layout, stored
@@ -581,12 +594,11 @@ def difference_between(old: Layout, new: Layout) -> str | None:
     in_file, in_call = (json.loads(layout.attributes["request"]) for layout in (old, new))
     if "status" in in_file:
         return "it is a single run, not a table of many"
-    old_versions, new_versions = old.versions, new.versions
-    if old_versions.get("nonholonomic") != new_versions.get("nonholonomic"):
-        texts = [of.get("nonholonomic") for of in (old_versions, new_versions)]
+    texts = [layout.versions.get("nonholonomic") for layout in (old, new)]
+    if texts[0] != texts[1]:
         return f"nonholonomic is {texts[0]} in the file and {texts[1]} here"
     # Another version of JAX may write the same equations in other words.
-    ignored = () if old_versions.get("jax") == new_versions.get("jax") else (EQUATIONS,)
+    ignored = () if old.versions.get("jax") == new.versions.get("jax") else (EQUATIONS,)
     for name in dict.fromkeys([*in_file, *in_call]):
         # As texts, in which a missing number, NaN, equals itself.
         if name in ignored or len({json.dumps(of.get(name), sort_keys=True) for of in (in_file, in_call)}) == 1:
@@ -600,6 +612,12 @@ def difference_between(old: Layout, new: Layout) -> str | None:
             return f"the axis {name} differs"
     if list(old.coords) != list(new.coords):
         return f"its axes are {', '.join(old.coords)}"
-    if (old.kinds, old.words, old.inner, old.chunk) != (new.kinds, new.words, new.inner, new.chunk):
+    if (old.kinds, old.inner, old.chunk) != (new.kinds, new.inner, new.chunk):
         return f"it was not written by a sweep in {new.chunks} chunks"
+    for name in new.kinds:
+        # Those of the file have been converted.
+        former = FORMER_WORDS if name == "status" else {}
+        texts = [", ".join(former.get(word, word) for word in layout.words.get(name, ())) for layout in (old, new)]
+        if texts[0] != texts[1]:
+            return f"the words of {name} are {texts[0]!r} in the file and {texts[1]!r} here"
     return None

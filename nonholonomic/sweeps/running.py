@@ -76,10 +76,9 @@ def remote_results(payload: bytes, needed: dict[str, str], first: int, count: in
     local = stamp()
     for name in MUST_AGREE:
         if local[name] != needed[name]:
-            raise RuntimeError(
-                f"the worker {platform.node()}, process {os.getpid()}, has {name} {local[name]}, and {needed[name]} is needed: "
-                "all workers of a table need the same versions"
-            )
+            worker = f"the worker {platform.node()}, process {os.getpid()}"
+            mismatch = f"has {name} {local[name]}, and {needed[name]} is needed"
+            raise RuntimeError(f"{worker}, {mismatch}: all workers of a table need the same versions")
     # Otherwise, threads of one worker would compile the same program twice.
     with _unpacking:
         work = _unpacked(payload)
@@ -253,10 +252,8 @@ def sweep(
     work = ChunkTask(job, axes, chunk_size)
     required, room = layout.bytes_of_cells(layout.cells), memory_of_machine()
     if path is None and 0.0 < room < required:
-        raise ValueError(
-            f"path = None: {layout.cells:.3g} cells take {1e-9 * required:.3g} GB, and this machine has "
-            f"{1e-9 * room:.3g} GB of memory; pass path= to keep them in a file"
-        )
+        sizes = f"{layout.cells:.3g} cells take {1e-9 * required:.3g} GB, and this machine has {1e-9 * room:.3g} GB of memory"
+        raise ValueError(f"path = None: {sizes}; pass path= to keep them in a file")
     store = None if path is None else ChunkStore(path, layout)
     try:
         with no_interrupt_lost() as raise_lost_interrupt:
@@ -276,12 +273,9 @@ def sweep(
         none_saved = f"interrupted; without path=, none of {with_spaces(layout.cells)} cells is saved"
         raise KeyboardInterrupt(none_saved if store is None else store.interrupted()) from None
     except ExecutorBroken as error:
-        state_of_file = (
-            "without path=, nothing is saved"
-            if store is None
-            else f"{path} has the finished chunks; repeat the call to resume"
-        )
-        raise RuntimeError(f"{error}, {state_of_file}") from error.__cause__
+        none_saved = "without path=, nothing is saved"
+        saved = f"{path} has the finished chunks; repeat the call to resume"
+        raise RuntimeError(f"{error}, {none_saved if store is None else saved}") from error.__cause__
     finally:
         if store is not None:
             store.close()
@@ -330,7 +324,8 @@ def layout_of(
     """The layout of a sweep's table; see `sweep`."""
     coords = {axis.name: axis.values for axis in (*axes, *inner)}
     described = {axis.name: axis for axis in (*axes, *inner)} | variables
-    words = {name: variable.words for name, variable in variables.items() if variable.words is not None}
+    # Lists are not equal to the tuples of a file.
+    words = {name: tuple(variable.words) for name, variable in variables.items() if variable.words is not None}
     without_unit = {*words, *(name for name, values in coords.items() if values.dtype.kind == "U")}
     units = {name: part.unit for name, part in described.items() if name not in without_unit}
     request = request | {"float": str(np.dtype(jnp.result_type(float)))}
@@ -338,7 +333,7 @@ def layout_of(
     attributes = attributes_of(json.dumps(request), [axis.name for axis in axes])
     long_names = {name: part.long_name for name, part in described.items() if part.long_name}
     kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
-    dims = {name: variable.inner for name, variable in variables.items() if variable.inner}
+    dims = {name: tuple(variable.inner) for name, variable in variables.items() if variable.inner}
     return Layout(coords, kinds, units, attributes, words, dims, chunk, long_names)
 
 
@@ -558,14 +553,10 @@ def _started(place: int, threads: int) -> ProcessPoolExecutor:
             # The exit status of a process that a signal has ended is negative; one that is no longer listed was ended at once.
             if started and not any((process.exitcode or 0) < 0 for process in started):
                 # It would end again.
-                raise RuntimeError(
-                    "a process ended before it computed anything; a script that starts processes must have its own calls under "
-                    "`if __name__ == '__main__':`"
-                ) from error
-    raise RuntimeError(
-        f"{MAX_STARTS} processes were killed while they started; if the machine has too little memory, start fewer: "
-        "local_processes(n=...)"
-    )
+                advice = "a script that starts processes must have its own calls under `if __name__ == '__main__':`"
+                raise RuntimeError(f"a process ended before it computed anything; {advice}") from error
+    advice = "if the machine has too little memory, start fewer: local_processes(n=...)"
+    raise RuntimeError(f"{MAX_STARTS} processes were killed while they started; {advice}")
 
 
 @contextlib.contextmanager

@@ -1,5 +1,7 @@
 """Files that are cut, changed or foreign: no wrong number read, none of another's bytes changed."""
 
+import errno
+import os
 import resource
 import shutil
 import zlib
@@ -11,8 +13,8 @@ import pytest
 from cheap_sweep import BLOCK, VARIABLES, cheap_sweep, finished_blocks, resumed
 from disk_faults import half_finished
 
-from nonholonomic.sweeps import Table
-from nonholonomic.sweeps._store import difference_between
+from nonholonomic.sweeps import Table, saved_cells
+from nonholonomic.sweeps._store import ChunkStore, Stored, difference_between
 from nonholonomic.sweeps.grid import Layout
 from nonholonomic.views import Page
 
@@ -131,6 +133,67 @@ def test_a_changed_number_is_refused_by_a_reader_and_repaired_by_a_sweep(tmp_pat
     with h5py.File(path, "r+") as file:
         file["value"][2 * BLOCK + 1] += 1e-16
     assert resumed(path) == {2}
+
+
+@pytest.mark.parametrize("error", [OSError(errno.EIO, os.strerror(errno.EIO)), None], ids=["error", "short"])
+def test_an_unreadable_block_alone_is_computed_again(error, tmp_path, monkeypatch):
+    """Of an unfinished table, and of a finished one; readers refuse both by the table's name."""
+    path, read = tmp_path / "table.h5", np.fromfile
+
+    def from_disk(file, kind, count, offset):
+        if place <= offset + count * kind.itemsize - 1 and offset <= place:
+            if error is not None:
+                raise error
+            count -= 1
+        return read(file, kind, count, offset=offset)
+
+    half_finished(path)
+    for is_unfinished in (True, False):
+        place = Stored(path, is_unfinished).places["count"] + BLOCK * 8
+        with monkeypatch.context() as patch:
+            patch.setattr(np, "fromfile", from_disk)
+            with pytest.raises(OSError, match=rf"cannot read {path}"):
+                Table.load(path)
+            with pytest.warns(RuntimeWarning, match=rf"{path} is damaged: 1 finished chunks .* computed again"):
+                store = ChunkStore(path, Stored(path, is_unfinished).layout)
+            store.close()
+            assert store.finished == set(range(3 if is_unfinished else 7)) - {1}
+        # The disk has recovered.
+        assert len(resumed(path)) == (4 if is_unfinished else 0)
+
+
+def test_a_table_that_an_earlier_version_began_is_refused_by_this_reason(tmp_path):
+    """Its file had no numbers, and each of its chunks was a file."""
+    path, folder = tmp_path / "table.h5", tmp_path / "table.h5.blocks"
+    half_finished(path)
+    with h5py.File(folder / "table.h5", "r+") as file:
+        del file["checksums/finished chunks"]
+        for name in VARIABLES:
+            values = file[name]
+            del file[name]
+            file.create_dataset(name, shape=values.shape, dtype=values.dtype)
+    (folder / "0.npz").touch()
+    text = rf"cannot read {path}, unfinished in {folder}: an earlier version began this table; resume with that version, or"
+    for read in (Table.load, lambda path: cheap_sweep(path, pytest.fail)):
+        with pytest.raises(OSError, match=text):
+            read(path)
+    assert sorted(file.name for file in folder.iterdir()) == ["0.npz", "table.h5"]
+
+
+def test_a_finished_table_is_read_whatever_is_in_the_folder_of_its_chunks(tmp_path):
+    path, unfinished = tmp_path / "table.h5", tmp_path / "table.h5.blocks" / "table.h5"
+    cheap_sweep(path)
+    unfinished.parent.mkdir()
+    unfinished.write_text("not a table")
+    assert resumed(path) == set()
+    assert saved_cells(path) == 50
+    assert unfinished.read_text() == "not a table"
+    # If the table is damaged, its chunks may be in the other file.
+    with h5py.File(path, "r+") as file:
+        file["value"][2 * BLOCK + 1] += 1e-16
+    with pytest.raises(OSError, match=rf"cannot read {path}, unfinished in {unfinished.parent}: it is not a table"):
+        cheap_sweep(path, pytest.fail)
+    assert unfinished.read_text() == "not a table"
 
 
 def check_cuts(images, folder, lengths_of):

@@ -10,16 +10,18 @@ import subprocess
 import sys
 import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pytest
 from cheap_sweep import BLOCK, VARIABLES, X, cheap_sweep, expected, finished_blocks, resumed
 from disk_faults import FOR_A_BLOCK, FOR_THE_FILE, FOR_THE_FOLDER, Killed, fail_on_disk
 
-from nonholonomic.sweeps import Table, axis, grid, sweep
-from nonholonomic.sweeps._store import ChunkStore, Stream
+from nonholonomic.sweeps import Table, Variable, axis, grid, sweep
+from nonholonomic.sweeps._store import ChunkStore, Stored, Stream
 from nonholonomic.sweeps.grid import Layout
 
 pytestmark = pytest.mark.oldest
@@ -213,8 +215,8 @@ def test_a_reader_beside_the_writer_sees_whole_blocks(tmp_path):
     path, counts = tmp_path / "table.h5", []
 
     def looking(function):
-        def operation(*arguments):
-            result = function(*arguments)
+        def operation(*arguments, **options):
+            result = function(*arguments, **options)
             if path.exists() or (tmp_path / "table.h5.blocks" / "table.h5").exists():
                 counts.append(len(finished_blocks(Table.load(path))))
             return result
@@ -229,6 +231,94 @@ def test_a_reader_beside_the_writer_sees_whole_blocks(tmp_path):
     assert len(counts) > 7 * 8
     assert counts == sorted(counts)
     assert set(counts) == set(range(8))
+
+
+def test_a_block_that_is_finished_while_the_file_is_opened_is_pending(tmp_path, monkeypatch):
+    """After each read of marks or checksums, a writer finishes another block."""
+    path = tmp_path / "table.h5"
+    fail_on_disk(monkeypatch, FOR_THE_FOLDER, torn=0.0, error=Killed())
+    with pytest.raises(Killed):
+        cheap_sweep(path)
+    monkeypatch.undo()
+    layout = cheap_sweep_layout(path)
+    store, blocks = ChunkStore(path, layout), iter(range(7))
+
+    def read(dataset, *arguments, read=h5py.Dataset.__array__, **options):
+        values = read(dataset, *arguments, **options)
+        if dataset.name.startswith("/checksums/"):
+            block = next(blocks)
+            store.write(block, expected(X[block * BLOCK : (block + 1) * BLOCK]))
+        return values
+
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py.Dataset, "__array__", read)
+        assert finished_blocks(Table.load(path)) == set()
+    begun = next(blocks)
+    assert begun >= len(VARIABLES) + 1
+    assert finished_blocks(Table.load(path)) == set(range(begun))
+    store.close()
+
+
+def cheap_sweep_layout(path):
+    """The layout of the unfinished table of a cheap sweep."""
+    return Stored(path, is_unfinished=True).layout
+
+
+@pytest.mark.parametrize("change", [lambda values: np.stack([values, values], 1), lambda values: values[:-1]])
+def test_results_of_another_shape_are_refused_and_no_block_is_lost(change, tmp_path):
+    """A job that is wrong in its last variable, from the fourth block on, or in the last."""
+    path = tmp_path / "table.h5"
+    for wrong in (3, 6):
+        size = 2 if wrong == 6 else BLOCK
+
+        def job(columns, count, wrong=wrong):
+            values = expected(columns["x"])
+            if count and columns["x"][0] >= X[wrong * BLOCK]:
+                values["count"] = change(values["count"][:count])
+            return values
+
+        with ThreadPoolExecutor(1) as executor:
+            text = rf"cannot write {path}: count of cells {wrong * BLOCK} to .* must have the shape \({size},\), not \("
+            with pytest.raises(ValueError, match=text):
+                cheap_sweep(path, job=job, executor=executor)
+        assert finished_blocks(Table.load(path)) == set(range(wrong))
+    assert resumed(path) == {6}
+
+
+def sweep_of_words(path, words, variable="status"):
+    """A sweep that is interrupted after its first block, or resumed and finished."""
+    variables = {variable: Variable("1", np.int8, words)}
+    job = lambda columns, count: {variable: (columns["x"] > 0.5).astype(np.int8)}  # noqa: E731
+    return sweep(job, [axis("x", "x", "s", X)], variables, {"what": "words"}, path=path, chunk=BLOCK, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("variable", "words"),
+    [("status", ["low", "high"]), ("status", ("reached_end", "failed")), ("ending", ("reached_end", "failed"))],
+)
+def test_words_of_a_list_and_of_earlier_versions_resume(variable, words, tmp_path):
+    path = tmp_path / "table.h5"
+    with pytest.MonkeyPatch.context() as patch:
+        fail_on_disk(patch, FOR_THE_FOLDER + 8, torn=0.0, error=Killed())
+        with pytest.raises(Killed):
+            sweep_of_words(path, words, variable)
+    table = sweep_of_words(path, words, variable)
+    right = ["completed" if (variable, word) == ("status", "reached_end") else word for word in words]
+    np.testing.assert_array_equal(table[variable], np.where(X > 0.5, right[1], right[0]))
+    np.testing.assert_array_equal(sweep_of_words(path, words, variable)[variable], table[variable])
+
+
+def test_other_words_are_told_and_words_with_spaces_are_refused(tmp_path):
+    path = tmp_path / "table.h5"
+    sweep_of_words(path, ("low", "high"))
+    text = "the words of status are 'low, high' in the file and 'low, large' here"
+    with pytest.raises(ValueError, match=rf"table\.h5 holds the result of another run: {text}; give another path"):
+        sweep_of_words(path, ("low", "large"))
+    for words in (("low", "very high"), ("low", "")):
+        for write in (lambda path, words=words: sweep_of_words(path, words), sweep_of_words(None, words).save):
+            with pytest.raises(ValueError, match=r"the words of status must not have spaces or be empty: \('low', "):
+                write(tmp_path / "other.h5")
+            assert list(tmp_path.iterdir()) == [path]
 
 
 def test_another_version_is_told_or_refused(tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """Ctrl-C by real signals to real processes: within two seconds a message states what is saved, and nothing crashes."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -180,6 +181,18 @@ def test_no_chunk_starts_after_an_interrupt_while_another_is_saved(tmp_path, mon
         is_over.set()
     assert caught
     assert len(begun) <= 2
+
+
+def test_an_interrupt_stays_one_if_the_file_cannot_be_read(tmp_path, monkeypatch):
+    def interrupted_while_saving(store, chunks, write=ChunkStore.write):
+        for chunk, values in itertools.islice(chunks, 2):
+            write(store, chunk, values)
+        (store.folder / "table.h5").write_text("not a table")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ChunkStore, "fill", interrupted_while_saving)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt, match=r"saved 16 of 50 cells to .*; run"):
+        cheap_sweep(tmp_path / "table.h5", executor=executor)
 
 
 def test_an_interrupt_during_garbage_collection_is_neither_lost_nor_printed_twice(tmp_path):
