@@ -461,7 +461,7 @@ class Viewable:
         require_unit(unit)
         runs, unit = [cast(Any, self), *require_others(self, others)], unit or self.unit
         runs = runs if draw is None else [run.drawn_by(draw) for run in runs]
-        return curves_in(stages_of(runs[0], runs, overlaid, unit), unit)
+        return curves_in(runs[0].stages(runs[1:], overlaid, unit), unit)
 
 
 def require_others(run: object, others: Any) -> Sequence[Any]:
