@@ -436,8 +436,9 @@ class ChunkStore:
                 versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
                 warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning)
             # The table records the versions with which it was begun.
-            self.layout = tables[0].layout
-        if [table.path for table in tables] != [self._unfinished]:
+            self.layout = tables[0].layout._replace(words=self.layout.words)
+        begun = [(table.path, table.layout.words) for table in tables]
+        if begun != [(self._unfinished, self.layout.words)]:
             self._begin(tables)
         unfinished = Stored(self.path, is_unfinished=True)
         # A chunk that could be read only the first time is not in a new file.
@@ -617,7 +618,9 @@ def difference_between(old: Layout, new: Layout) -> str | None:
     for name in new.kinds:
         # Those of the file have been converted.
         former = FORMER_WORDS if name == "status" else {}
-        texts = [", ".join(former.get(word, word) for word in layout.words.get(name, ())) for layout in (old, new)]
-        if texts[0] != texts[1]:
-            return f"the words of {name} are {texts[0]!r} in the file and {texts[1]!r} here"
+        words = [[former.get(word, word) for word in layout.words.get(name, ())] for layout in (old, new)]
+        # Words may have been added since.
+        if words[0] != words[1][: len(words[0])]:
+            texts = [repr(", ".join(listed)) for listed in words]
+            return f"the words of {name} are {texts[0]} in the file and {texts[1]} here"
     return None

@@ -338,6 +338,11 @@ class AbstractFormulation(AbstractMode):
     def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
         """Coordinates and velocity, each (n,), of a state."""
 
+    def acceleration(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+        """Second derivative of the coordinates, by the chain rule through this formulation's state."""
+        state = self.state(q, rate)
+        return jax.jvp(self.split, (state,), (self.field(jnp.asarray(t), state),))[1][1]
+
     def margin(self, t: Float[ArrayLike, ""], y: State) -> Margin:
         return self.system.margin(t, *self.split(y))
 

@@ -32,14 +32,6 @@ Frame = Callable[[Coordinates], Float[Array, "n n"]]
 START_TOLERANCE = 1e-9
 
 
-def acceleration(
-    formulation: AbstractFormulation, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates
-) -> Coordinates:
-    """Second derivative of the coordinates, by the chain rule through a formulation's state."""
-    state = formulation.state(q, rate)
-    return jax.jvp(formulation.split, (state,), (formulation.field(jnp.asarray(t), state),))[1][1]
-
-
 def structure_constants(frame: Frame, q: Coordinates) -> Float[Array, "n n n"]:
     """Structure coefficients of a frame, [E_a, E_b] = c^c_ab E_c, at [c, a, b].
 
