@@ -545,7 +545,7 @@ def planned_stage(plan: Plan) -> Stage:
     ribbons = [ribbon(line, normals(np, problem.scene, line), RAISED * length, THIN * length) for line in lines]
     still = [("candidates", ribbons)]
     blocks = [
-        prism(foot, fixed(surface, tuple(frame[3])), HEIGHT * length)
+        prism(foot, fixed(problem.scene.surface, tuple(frame[3])), HEIGHT * length)
         for foot, (_, frame) in zip(feet, problem.standing, strict=True)
     ]
     still += [("obstacles", blocks)] if blocks else []

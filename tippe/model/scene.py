@@ -155,7 +155,7 @@ class Launch(Bounded):
 
     def __getstate__(self) -> dict[str, Any]:
         # Copies are shown in SI units: pickle could not set the attribute of a frozen module.
-        return self.__dict__
+        return dict(vars(self))
 
     def suspicion(self) -> str | None:
         fastest = largest(self.spin)
