@@ -141,7 +141,6 @@ class AbstractTrajectory(AbstractRun):
     #: The fields with a value for each time, along the last axis.
     by_time: ClassVar[tuple[str, ...]] = ("t", "states", "cyclic", "spin_angle", "work")
 
-    readable: ClassVar[tuple[str, ...]] = tuple(QUANTITIES)
     quantities: ClassVar[dict[str, Quantity]] = QUANTITIES
     portrait_axes = ("theta", "theta_rate")
 
