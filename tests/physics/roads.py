@@ -18,7 +18,7 @@ import tippe
 from nonholonomic.compilation.xla_cpu import compile_quickly
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
-from nonholonomic.runs.table import WORDS, TableJob, errors_of, second_tolerance
+from nonholonomic.runs.table import WORDS, TableJob, errors_of, other_tolerances
 from tippe.runs.model import INVERSIONS, TopModel
 
 ANGLE, TOLERANCE = 0.95 * np.pi, 1e-9
@@ -27,7 +27,7 @@ ANGLE, TOLERANCE = 0.95 * np.pi, 1e-9
 HORIZON, HORIZON_OF_FLIGHTS = 8.0, 3.0
 
 #: Of runs with their path, whose frame does not turn with the top, so that they err more at the same tolerance.
-OF_PATHS = second_tolerance(TOLERANCE)
+OF_PATHS = other_tolerances(TOLERANCE)[0]
 
 #: Error bounds of a table by which another road may differ, which has an error of its own.
 APART = 2.0
@@ -44,13 +44,13 @@ CODES = {
 def table_of(scenes: Batch, count: int, t1: float) -> dict[str, np.ndarray]:
     """The table of these scenes, with errors, and the status as words."""
     model = TopModel.timed(scenes.scene, scenes.launch, ANGLE)
-    first, second = (
+    first, *others = (
         TableJob(model, INVERSIONS, t1, "first", Settings(tolerance))(scenes.columns, count)
-        for tolerance in (TOLERANCE, second_tolerance(TOLERANCE))
+        for tolerance in (TOLERANCE, *other_tolerances(TOLERANCE))
     )
     silent = tuple(int(tippe.Status.of(word)) for word in ("failed", "unresolved"))
     words = np.array(WORDS)[first["status"]]
-    bounds = errors_of(first, second, ("time", "end_time", "end_theta"), tuple(model.counters), silent)
+    bounds = errors_of([first, *others], ("time", "end_time", "end_theta"), tuple(model.counters), silent)
     return first | bounds | {"word": words}
 
 
