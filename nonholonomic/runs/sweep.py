@@ -148,7 +148,7 @@ def sweep(
     - `crossing`: "first"; "last" for the last fall of the event function through zero, after which the function stays
       below zero until `t1`; "both" for both times from one run.
     - `times`, `quantities`: times [s] within [0, t1] and names of quantities, to sample every run.
-    - `errors`: whether to run every cell again at a hundredth of the tolerance, for error bounds.
+    - `errors`: whether to run every cell again at 1e-2 and 1e-4 of the tolerance, for error bounds.
     - `sensitivities`: names of the parameters with respect to which the times are differentiated.
     - `scattered`: whether the lists are columns of equal length instead of axes of a grid.
     - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1. In a run with resets, the
@@ -165,7 +165,7 @@ def sweep(
     With `sensitivities`, the table also contains the derivative of `time` with respect to each parameter, such as
     `time_by_drag` for `"system.modes[0].drag"`, and for a system with resets `grazes`: 1 if the derivative is NaN
     because the margin of a mode only touched zero. With `errors`, `time_error` and so on are bounds: infinite if the
-    two runs disagree on the status. With `times`, the table contains the quantities, NaN after the end of a run, in
+    runs disagree on the status. With `times`, the table contains the quantities, NaN after the end of a run, in
     place of the ends; without an event, runs are only sampled.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;

@@ -1,6 +1,6 @@
 """The cells of a table of any model: event times, how and where runs end, samples, error bounds and derivatives."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -93,23 +93,18 @@ class TableJob(NamedTuple):
         event = self.form.event
         words = {f"{name}_time": f"{name} {event} time" for name in ("first", "last")}
         words[self.form.time] = {"event": "time of the event", "loss of contact": event}.get(event, f"{event} time")
-        variables = {name: Variable("s", np.float64, long_name=words[name]) for name in self.times}
-        variables |= {
-            name: Variable("s", np.float64, long_name=long_name)
-            for name, (long_name, _) in self.model.further_times.items()
-        }
+        words = {name: words[name] for name in self.times}
+        words |= {name: text for name, (text, _) in self.model.further_times.items()}
+        variables = {name: Variable("s", np.float64, long_name=text) for name, text in words.items()}
         variables |= self._ending({} if self.samples is not None else self.model.ends)
         if self.slopes and not self.model.smooth:
             variables |= {"grazes": Variable("1", np.int8, long_name="whether an event on the way was grazing")}
         if self.errors:
-            for name in self.bounded:
-                long_name = f"error of the {variables[name].long_name}"
-                variables[f"{name}_error"] = Variable(variables[name].unit, np.float64, long_name=long_name)
-            long_name = "whether the runs disagree on the status"
-            variables["status_error"] = Variable("1", np.int8, long_name=long_name)
-            for name, words in self.model.counters.items():
-                long_name = f"difference of the runs in {words}"
-                variables[f"{name}_error"] = Variable("1", np.int64, long_name=long_name)
+            words = {name: f"error of the {variables[name].long_name}" for name in self.bounded}
+            words |= {name: f"difference of the runs in {text}" for name, text in self.model.counters.items()}
+            errors = {f"{name}_error": variables[name]._replace(long_name=text) for name, text in words.items()}
+            errors["status_error"] = Variable("1", np.int8, long_name="whether the runs disagree on the status")
+            variables |= errors
         if self.samples is not None:
             variables |= self.samples.variables(self.model)
         return variables if self.form.order is None else {name: variables[name] for name in self.form.order}
@@ -143,12 +138,11 @@ class TableJob(NamedTuple):
         order = np.argsort(~legal | (np.arange(len(legal)) >= count), kind="stable")
         ordered = {name: values[order] for name, values in columns.items()}
         variables = self._of_legal(ordered, int(legal[:count].sum()))
-        results = {}
+        results, illegal = {}, {"status": self.form.codes[Status.ILLEGAL]}
         for name, values in variables.items():
             # Illegal cells are NaN, or 0 for integers, with the status "illegal".
             values = np.asarray(values)[np.argsort(order)]
-            nothing = np.nan if np.issubdtype(values.dtype, np.floating) else 0
-            nothing = self.form.codes[Status.ILLEGAL] if name == "status" else nothing
+            nothing = illegal.get(name, np.nan if np.issubdtype(values.dtype, np.floating) else 0)
             is_legal = legal.reshape(-1, *(1,) * (values.ndim - 1))
             results[name] = np.where(is_legal, values, nothing).astype(values.dtype)
         return results
@@ -165,27 +159,19 @@ class TableJob(NamedTuple):
             return sampled
         variables = self._results(cells, columns, size, count, self.slopes)
         if self.errors:
-            runs = [variables]
-            for tolerance in other_tolerances(float(self.settings.tolerance)):
-                job = self._replace(settings=self.settings.with_tolerance(as_number(tolerance)))
-                runs.append(job._results(cells, columns, size, count, None))
-            silent = tuple(self.form.codes[list(SILENT)])
-            errors = errors_of(runs, self.bounded, tuple(self.model.counters), silent)
-            located = {f"{name}_error": LOCATED * size for name, size in self._sizes_at_events(variables).items()}
-            variables |= errors | {name: np.maximum(errors[name], error) for name, error in located.items()}
-        names = () if self.samples is None else self.samples.names
-        return variables | {name: sampled[name] for name in names}
-
-    def _sizes_at_events(self, variables: dict[str, Any]) -> dict[str, Float[np.ndarray, " cells"]]:
-        """The sizes of what depends on where events are located, 0 in cells without events: of a component at the end, the size
-        of the largest in its unit."""
-        ends = self.model.ends if self.samples is None else {}
-        has_event = (not self.model.smooth) | (variables["status"] != self.form.codes[Status.COMPLETED])
-        sizes = {} if self.model.smooth else {"end_time": variables["end_time"]}
-        for name, variable in ends.items():
-            alike = [np.abs(variables[other]) for other in ends if ends[other].unit == variable.unit]
-            sizes[name] = np.where(has_event, np.max(alike, axis=0), 0.0)
-        return sizes
+            tolerances = map(as_number, other_tolerances(float(self.settings.tolerance)))
+            jobs = [self._replace(settings=self.settings.with_tolerance(tolerance)) for tolerance in tolerances]
+            runs = [variables, *(job._results(cells, columns, size, count, None) for job in jobs)]
+            # Where events are located: the error of a component is relative to the largest of its unit.
+            ends = self.model.ends
+            least: dict[str, float | Float[np.ndarray, " cells"]] = dict.fromkeys(self.bounded, 0.0)
+            has_event = (not self.model.smooth) | (variables["status"] != self.form.codes[Status.COMPLETED])
+            for name in [name for name in ends if name in least]:
+                alike = [np.abs(variables[other]) for other in ends if ends[other].unit == ends[name].unit]
+                least[name] = LOCATED * np.where(has_event, np.max(alike, axis=0), 0.0)
+            least["end_time"] = 0.0 if self.model.smooth else LOCATED * variables["end_time"]
+            variables |= errors_of(runs, least, tuple(self.model.counters), self.form.codes[list(SILENT)])
+        return sampled | variables
 
     def _results(
         self, cells: AbstractModel, columns: dict[str, Any], size: int, count: int, slopes: dict[str, str] | None
@@ -210,7 +196,6 @@ class TableJob(NamedTuple):
             else:
                 outcome = ensemble.solve(self.t1, count, settings)
         status, ends = at_the_end(cells, ensemble, outcome, settings.tolerance)
-        codes = self.form.codes[np.asarray(status)]
         has_event = np.asarray(status) == Status.EVENT
         variables = {}
         if self.times:
@@ -219,7 +204,7 @@ class TableJob(NamedTuple):
                 time = outcome.first_crossing
             is_silent = self.form.nan_if_failed & np.isin(status, SILENT)
             variables[self.times[-1]] = np.where(is_silent, np.nan, time)
-        variables |= {"status": codes, "end_time": np.asarray(outcome.end_time)}
+        variables |= {"status": self.form.codes[np.asarray(status)], "end_time": np.asarray(outcome.end_time)}
         if self.samples is None:
             variables |= {name: np.asarray(values) for name, values in ends.items()}
         variables |= {"steps": np.asarray(outcome.steps), "rejected": np.asarray(outcome.rejected)}
@@ -322,14 +307,9 @@ SAFETY = 5.0
 #: 90 times smaller than the error.
 SAFETY_OF_HISTORIES, CONVERGING = 100.0, 1.0 / 3.0
 
-#: Smaller relative differences come from where events are located, not from the tolerance.
-NOISE = 1e-9
-
-#: Least relative error of values that accumulate round-off over thousands of steps.
-ROUND_OFF = 1e-14
-
-#: Least relative error of the ends of runs with events, which are located with it whatever the tolerance.
-LOCATED = 4e-10
+#: Relative errors: of values that accumulate round-off over thousands of steps; of the ends of runs with events, which are
+#: located with it whatever the tolerance; and of differences between runs that are not from the tolerance.
+ROUND_OFF, LOCATED, NOISE = 1e-14, 4e-10, 1e-9
 
 
 def other_tolerances(tolerance: float) -> list[float]:
@@ -337,11 +317,10 @@ def other_tolerances(tolerance: float) -> list[float]:
     smaller tolerance than the first, there is one other run, at a hundred times that tolerance, and the bound is up to a
     hundred times wider."""
     tightest = TIGHTEST if jnp.result_type(float) == jnp.float64 else TIGHTEST_IN_SINGLE
-    finer = [max(tolerance / FINER, tightest), max(tolerance / FINER**2, tightest)]
     # Because of rounding, the quotient of 1e-12 may be below the least tolerance.
     if tolerance / FINER <= 0.99 * tightest:
         return [tolerance * FINER]
-    return finer if finer[1] < 0.5 * finer[0] else finer[:1]
+    return sorted({max(tolerance / FINER**power, tightest) for power in (1, 2)}, reverse=True)
 
 
 def error_bound(
@@ -361,36 +340,34 @@ def error_bound(
     is_finite = np.isfinite(values)
     agree = agree & (is_finite == is_finite[0]).all(axis=0)
     first, second, third = np.where(is_finite.all(axis=0), values, 0.0)[[0, 1, -1]]
-    of_first = np.abs(first - second), np.abs(first - third)
-    of_others = np.abs(second - third)
-    converges = same_history & (of_others <= np.maximum(CONVERGING * np.minimum(*of_first), NOISE * np.abs(first)))
-    ratio = np.where(converges, SAFETY, SAFETY_OF_HISTORIES)
-    bound = ratio * np.maximum(np.maximum(*of_first), of_others)
+    gaps = np.abs([first - second, first - third, second - third])
+    converges = same_history & (gaps[2] <= np.maximum(CONVERGING * np.min(gaps[:2], axis=0), NOISE * np.abs(first)))
+    bound = np.where(converges, SAFETY, SAFETY_OF_HISTORIES) * np.max(gaps, axis=0)
     return np.where(agree, np.maximum(bound, ROUND_OFF * np.abs(first)), np.inf)
 
 
 def errors_of(
     runs: Sequence[dict[str, Num[np.ndarray, " cells"]]],
-    bounded: tuple[str, ...],
+    least: Mapping[str, float | Float[np.ndarray, " cells"]],
     counts: tuple[str, ...],
-    silent: tuple[int, ...],
+    silent: Sequence[int] | Int[np.ndarray, " codes"],
 ) -> dict[str, Num[np.ndarray, " cells"]]:
     """The additional variables of a table with errors; their names have the suffix "_error".
 
     **Arguments:**
 
     - `runs`: the variables of the first run of every cell and of the others.
-    - `bounded`, `counts`: names of the variables that get bounds, and of those that count events.
+    - `least`: name of a variable -> least bound of its error; `counts`: names of the variables that count events.
     - `silent`: status codes of runs without a result; such runs count as disagreeing.
 
     **Returns:** bounds; for each count the largest difference from the first run; and 1 as `status_error` if the runs
     disagree on the status or are silent.
     """
-    stacked = {name: np.stack([run[name] for run in runs]) for name in ("status", *bounded, *counts)}
-    status = stacked["status"]
-    agree = (status == status[0]).all(axis=0) & ~np.isin(status[0], silent)
+    stacked = {name: np.stack([run[name] for run in runs]) for name in ("status", *least, *counts)}
+    status = runs[0]["status"]
+    agree = (stacked["status"] == status).all(axis=0) & ~np.isin(status, silent)
     differences = {name: np.abs(stacked[name] - stacked[name][0]).max(axis=0) for name in counts}
     is_same = np.all([np.ones_like(agree), *(difference == 0 for difference in differences.values())], axis=0)
-    bounds = {name: error_bound(stacked[name], agree, is_same) for name in bounded}
+    bounds = {name: np.maximum(error_bound(stacked[name], agree, is_same), error) for name, error in least.items()}
     errors = bounds | {"status": (~agree).astype(np.int8)} | differences
     return {f"{name}_error": np.asarray(error) for name, error in errors.items()}

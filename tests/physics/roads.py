@@ -50,7 +50,9 @@ def table_of(scenes: Batch, count: int, t1: float) -> dict[str, np.ndarray]:
     )
     silent = tuple(int(tippe.Status.of(word)) for word in ("failed", "unresolved"))
     words = np.array(WORDS)[first["status"]]
-    bounds = errors_of([first, *others], ("time", "end_time", "end_theta"), tuple(model.counters), silent)
+    bounds = errors_of(
+        [first, *others], dict.fromkeys(("time", "end_time", "end_theta"), 0.0), tuple(model.counters), silent
+    )
     return first | bounds | {"word": words}
 
 

@@ -240,7 +240,7 @@ def runs_of(kind, count, tolerances):
 def judged(first, *others, true, counts):
     """How many times a table with errors has, how many err by more than the bound, for how many the bound is more than 30
     times the error, and how many cells have a wrong status of which nothing is said."""
-    bounds = errors_of([first, *others], ("time", "end_time", "end_theta"), counts, (3, 6))
+    bounds = errors_of([first, *others], dict.fromkeys(("time", "end_time", "end_theta"), 0.0), counts, (3, 6))
     finite = np.isfinite(first["time"]) & np.isfinite(true["time"]) & np.isfinite(bounds["time_error"])
     bound = bounds["time_error"][finite]
     error = np.abs(first["time"][finite] - true["time"][finite])

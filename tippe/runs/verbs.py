@@ -268,9 +268,9 @@ def inversion_table(
       crossings and can miss a loss of contact shorter than a step.
     - `scattered`: whether the lists are columns of equal length instead of axes of a grid: the k-th cell has the k-th
       number of each list. The only axis of the table is then "cell", and the columns are variables.
-    - `errors`: whether to run every cell again at a hundredth of the tolerance, for error bounds; this costs 2.8 times
-      as much as a table without errors. Below a tolerance of 1e-12, the second run has a hundred times the tolerance
-      instead of a hundredth, and the bounds are wider.
+    - `errors`: whether to run every cell again at 1e-2 and 1e-4 of the tolerance, for error bounds; this costs 6 times
+      as much as a table without errors. Below a tolerance of 1e-12, there is one other run, at a hundred times the
+      tolerance, and the bounds are wider.
     - `sensitivities`: names of the parameters with respect to which the times are differentiated, such as
       `["scene.friction.mu", "launch.theta"]`; the end of a name is enough if only one parameter matches.
     - `progress`: whether to show progress, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it
@@ -293,9 +293,9 @@ def inversion_table(
     - `hops`, with `contact="hybrid"`: number of flights until the run ended. The run continues through flights, and may
       reach the angle in flight.
     - `sticks`, with `SetValuedCoulomb`: number of changes from slip to rolling outside impacts.
-    - `time_error` [s], with `errors`: a bound that is infinite if the two runs disagree on the status or failed, and 0 if
+    - `time_error` [s], with `errors`: a bound that is infinite if the runs disagree on the status or failed, and 0 if
       both find no time. `end_time_error` and `end_theta_error` are such bounds, too; `hops_error` and `sticks_error` are
-      the differences of the two runs; `status_error` is 1 if the runs disagree on the status or failed.
+      the differences of the runs; `status_error` is 1 if the runs disagree on the status or failed.
       `Table.digits("time")` shows the correct digits.
     - `time_by_mu` and so on, with `sensitivities`: the derivative of `time` with respect to each parameter; 0 if the top
       did not invert. Derivatives pass through flights, impacts, stick and slip.
