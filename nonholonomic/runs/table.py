@@ -368,6 +368,6 @@ def errors_of(
     agree = (stacked["status"] == status).all(axis=0) & ~np.isin(status, silent)
     differences = {name: np.abs(stacked[name] - stacked[name][0]).max(axis=0) for name in counts}
     is_same = np.all([np.ones_like(agree), *(difference == 0 for difference in differences.values())], axis=0)
-    bounds = {name: np.maximum(error_bound(stacked[name], agree, is_same), error) for name, error in least.items()}
+    bounds = {name: np.fmax(error_bound(stacked[name], agree, is_same), error) for name, error in least.items()}
     errors = bounds | {"status": (~agree).astype(np.int8)} | differences
     return {f"{name}_error": np.asarray(error) for name, error in errors.items()}
