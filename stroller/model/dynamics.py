@@ -22,22 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import (
-    AbstractSurface,
-    Component,
-    Place,
-    Plane,
-    Vector,
-    add,
-    cross,
-    dot,
-    multiply,
-    none_if_zero,
-    scale,
-    stacked,
-    subtract,
-    sum_vectors,
-)
+from nonholonomic.geometry import AbstractSurface, Component, Place, Plane, Vector
+from nonholonomic.geometry.vector import add, cross, dot, multiply, none_if_zero, scale, stacked, subtract, sum_vectors
 from nonholonomic.validation import Bound, Bounded, as_number, largest
 
 from ..friction import AbstractFriction, Drag, WheelMotion

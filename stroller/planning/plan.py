@@ -129,7 +129,7 @@ class Plan(eqx.Module):
 
         for line in planned_stage(self).arena.lines if axes == 3 else ():
             draw(line, "0.7", 0.4)
-        for foot in outlines_of_obstacles(problem):
+        for foot in (fixed(surface, line) for line in problem.outlines):
             above.fill(*foot.T[:2], color="0.6") if axes == 2 else draw(foot[[*range(len(foot)), 0]], "0.4", 1.5)
         for line in self.candidates:
             draw(line, "0.75", 0.7)
@@ -203,7 +203,15 @@ def checked_drive(problem: Problem, drive: Drive, tolerance: float) -> Plan:
         name: float(min(np.min(values[name]) - low, high - np.max(values[name])))
         for name, (low, high) in ranges.items()
     }
-    clearance, nearest = clearance_of(problem, np.asarray(run.t), corners)
+    clearance, nearest = np.inf, -1
+    if problem.obstacles:
+        gaps, times = problem.gaps(corners), np.asarray(run.t)
+        # Between two times, no corner moves further than this.
+        moved = np.linalg.norm(np.diff(corners, axis=0), axis=-1).max(axis=-1)
+        step = np.flatnonzero(np.minimum(gaps[:-1], gaps[1:]).min(axis=-1) - moved < gaps.min())
+        inner = times[step][:, None] + np.diff(times)[step][:, None] * np.arange(1, FINER) / FINER
+        least = np.concatenate([gaps, problem.gaps(CubicSpline(times, corners)(inner.ravel()))]).min(axis=0)
+        clearance, nearest = float(least.min()), int(np.argmin(least))
     away = np.asarray(run.state)[-1, : 2 * axes] - np.asarray(problem.goal_pose)
     turn = 0.0 if goal.heading is None else 2.0 * np.arcsin(np.minimum(1.0, 0.5 * np.linalg.norm(away[axes:])))
     errors = float(np.linalg.norm(away[:axes])), float(turn), abs(float(run.speed[-1]) - float(goal.speed))
@@ -242,22 +250,6 @@ def seen_along(
     """The corners [m] of the footprint, the force [N] and the torque [N m] of a drive along a run."""
     corners = corners_of(dynamics, footprint, states.T[: 2 * dynamics.surface.axes])
     return corners, *drive(times, dynamics.geometry(states.T).motion)
-
-
-def clearance_of(
-    problem: Problem, times: Float[np.ndarray, " times"], corners: Float[np.ndarray, "times 4 axes"]
-) -> tuple[float, int]:
-    """The least distance [m] between the footprint and an obstacle, negative for an overlap, and the obstacle's number;
-    infinite without obstacles."""
-    if not problem.obstacles:
-        return np.inf, -1
-    gaps = problem.gaps(corners)
-    # Between two times, no corner moves further than this.
-    moved = np.linalg.norm(np.diff(corners, axis=0), axis=-1).max(axis=-1)
-    step = np.flatnonzero(np.minimum(gaps[:-1], gaps[1:]).min(axis=-1) - moved < gaps.min())
-    inner = times[step][:, None] + np.diff(times)[step][:, None] * np.arange(1, FINER) / FINER
-    least = np.concatenate([gaps, problem.gaps(CubicSpline(times, corners)(inner.ravel()))]).min(axis=0)
-    return float(least.min()), int(np.argmin(least))
 
 
 # Planning.
@@ -511,8 +503,8 @@ CROSS = 0.1
 #: Height of the camera in units of its distance along the ground, from which obstacles do not hide the stroller.
 RISE = 1.2
 
-#: Sides of a drawn disc, and outlines of the footprint in a plot.
-SIDES, OUTLINES = 48, 13
+#: Outlines of the footprint in a plot.
+OUTLINES = 13
 
 #: Colours of obstacles, of candidates, and of the goal.
 STONE, FAINT, GREEN = 0x8A8F98, 0x5B8DB8, 0x1F8A4C
@@ -524,31 +516,30 @@ CLOSED = [0, 1, 2, 3, 0]
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 
-def outlines_of_obstacles(problem: Problem) -> Iterator[Float[np.ndarray, "corners 3"]]:
-    """The outlines of the obstacles on the ground [m], in the fixed frame."""
-    surface, angle = problem.scene.surface, 2.0 * np.pi * np.arange(SIDES) / SIDES
-    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    for part, frame in problem.standing:
-        corners = part.corners if isinstance(part, Box) else np.array(part.centre) + float(part.radius) * unit
-        in_space = frame[0] + corners @ frame[1:3]
-        ground = surface.chart(tuple(corners.T))[0] if problem.tangent is None else surface.nearest(tuple(in_space.T))
-        yield fixed(surface, ground)
-
-
 def planned_stage(plan: Plan) -> Stage:
     """The run of a plan on its stage, with obstacles, candidates, footprint and goal."""
     (stage,) = plan.run.stages()
     problem, (show, *_) = plan.problem, stage.shows
     length, count = float(problem.scene.body.wheelbase), len(show.times)
-    feet = list(outlines_of_obstacles(problem))
+    feet = [fixed(problem.scene.surface, line) for line in problem.outlines]
     ground, lines = ground_of([plan.run], stage.arena.normal, *feet), list(plan.candidates)
-    ribbons = [ribbon(line, normals(np, problem.scene, line), RAISED * length, THIN * length) for line in lines]
-    still = [("candidates", ribbons)]
-    blocks = [
-        prism(foot, fixed(problem.scene.surface, tuple(frame[3])), HEIGHT * length)
-        for foot, (_, frame) in zip(feet, problem.standing, strict=True)
-    ]
-    still += [("obstacles", blocks)] if blocks else []
+    # Thin bands along the candidates, and upright prisms on the outlines, each with a lid of triangles about its middle.
+    ribbons, blocks = [], []
+    for line in lines:
+        normal = normals(np, problem.scene, line)
+        across = np.cross(normal, np.gradient(line, axis=0))
+        across *= THIN * length / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+        above = line + RAISED * length * normal
+        sides = np.stack([above - across, above + across], axis=1)
+        ribbons.append(Mesh(sides.reshape(-1, 3), of_grid(len(line), 2), FAINT))
+    for foot, (_, frame) in zip(feet, problem.standing, strict=True):
+        up = fixed(problem.scene.surface, tuple(frame[3]))
+        level = foot @ up
+        top = foot + (level.max() + HEIGHT * length - level)[:, None] * up
+        columns = np.stack([np.broadcast_to(top.mean(axis=0), top.shape), top, foot], axis=1)
+        closed = np.concatenate([columns, columns[:1]])
+        blocks.append(Mesh(closed.reshape(-1, 3), of_grid(len(closed), 3), STONE))
+    still = [("candidates", ribbons), *([("obstacles", blocks)] if blocks else [])]
     ends = goal_corners(problem, 2.0 * RAISED * length)
     pairs = (ends[:2], ends[2:]) if problem.goal.heading is None else (ends, np.roll(ends, -1, axis=0))
     arms = [bar(tuple(a), tuple(b), 2.0 * THIN * length, GREEN) for a, b in zip(*pairs, strict=True)]
@@ -582,20 +573,3 @@ def outlines(
     flat = footprint.corners(*(fixed(surface, part) for part in frame_of(dynamics, poses.T)))
     ground = surface.nearest(own(surface, np.moveaxis(np.asarray(flat), -1, 0)))
     return fixed(surface, ground) + raised * dynamics.side * fixed(surface, surface.normal(ground))
-
-
-def prism(foot: Float[np.ndarray, "corners 3"], up: Float[np.ndarray, " 3"], height: float) -> Mesh:
-    """An upright prism on its corners on the ground, and a lid of triangles about its middle."""
-    level = foot @ up
-    top = foot + (level.max() + height - level)[:, None] * up
-    columns = np.stack([np.broadcast_to(top.mean(axis=0), top.shape), top, foot], axis=1)
-    closed = np.concatenate([columns, columns[:1]])
-    return Mesh(closed.reshape(-1, 3), of_grid(len(closed), 3), STONE)
-
-
-def ribbon(line: Corners, normal: Corners, raised: float, half: float) -> Mesh:
-    """A thin band along a line, above the ground."""
-    across = np.cross(normal, np.gradient(line, axis=0))
-    across *= half / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
-    above = line + raised * normal
-    return Mesh(np.stack([above - across, above + across], axis=1).reshape(-1, 3), of_grid(len(line), 2), FAINT)

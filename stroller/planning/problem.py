@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import AbstractSurface, Plane, Vector, cross, scale
+from nonholonomic.geometry import AbstractSurface, Plane, Vector, cross, difference, dot, scale, sum_vectors
 from nonholonomic.integration.problem import require_run
 from nonholonomic.text import shown
 from nonholonomic.validation import (
@@ -19,7 +19,6 @@ from nonholonomic.validation import (
     as_number,
     is_traced,
     largest,
-    require,
     require_all,
     require_kind,
     require_scalars,
@@ -196,14 +195,14 @@ class Obstacles(eqx.Module):
     disc_frames: Frame
 
     @classmethod
-    def of(cls, obstacles: Sequence[tuple[Box | Disc, Frame]]) -> "Obstacles":
-        """Boxes and discs in their frames as arrays, padded."""
+    def of(cls, obstacles: Sequence[tuple[Box | Disc, Frame]], padding: int = PADDING) -> "Obstacles":
+        """Boxes and discs in their frames as arrays, padded to multiples of a number."""
         boxes = [(part, frame) for part, frame in obstacles if isinstance(part, Box)]
         discs = [(part, frame) for part, frame in obstacles if isinstance(part, Disc)]
         circles = np.array([[*disc.centre, disc.radius] for disc, _ in discs], dtype=float).reshape(-1, 3)
         frames = (np.array([frame for _, frame in pairs]).reshape(-1, 4, 3) for pairs in (boxes, discs))
         arrays = np.array([box.corners for box, _ in boxes]).reshape(-1, 4, 2), circles[:, :2], circles[:, 2], *frames
-        return cls(*arrays).padded(*(-(-len(pairs) // PADDING) * PADDING for pairs in (boxes, discs)))
+        return cls(*arrays).padded(*(-(-len(pairs) // padding) * padding for pairs in (boxes, discs)))
 
     def padded(self, boxes: int, discs: int) -> "Obstacles":
         """The obstacles with others far away, so that there are so many boxes and discs; in NumPy, because JAX would
@@ -238,9 +237,13 @@ def seen_from(frames: Frame, corners: Corners) -> tuple[Points, Numbers | float]
     return flat, xp.maximum(_least(height, -1), _least(-height, -1))
 
 
-def moved(part: Box | Disc, centre: ArrayLike | tuple[float, float], angle: ArrayLike) -> Box | Disc:
-    """An obstacle at another place."""
-    return Box(centre, part.size, angle) if isinstance(part, Box) else Disc(centre, part.radius)
+def outline_of(part: Box | Disc) -> Float[np.ndarray, "sides 2"]:
+    """Points around an obstacle [m], counterclockwise, among them its corners."""
+    share = np.arange(SIDES) / SIDES
+    if isinstance(part, Disc):
+        angle = 2.0 * np.pi * share
+        return np.array(part.centre) + float(part.radius) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.stack([np.interp(4.0 * share, range(5), np.append(x, x[0])) for x in part.corners.T], axis=-1)
 
 
 def require_obstacles(obstacles: Iterable[Box | Disc]) -> tuple[Box | Disc, ...]:
@@ -431,6 +434,28 @@ FARTHEST = 1e5
 #: Headings at which a goal without a heading is examined.
 HEADINGS = 72
 
+#: Share of every limit's range to keep in reserve at first: the check examines the ride between the points at which the
+#: optimiser looks.
+LIMIT_RESERVE = 0.003
+
+#: Curvature of the arcs of the searches for neighbouring lanes, in units of the greatest one: less, because the fork takes time
+#: to turn, and nearly all, because a somewhat wider turn may need a detour.
+SEARCH_CURVATURES = (0.98, 0.85)
+
+#: Distance from the start, the goal and the obstacles [least turning radii] that a path may need to turn round: three circles
+#: that touch each other reach as far.
+TURNING_SPACE = 4.0
+
+#: Steps of a straight way from the middle of a map, and points of its table from the middle to each side.
+STEPS, MAPPED = 48, 64
+
+#: Points around an obstacle, steps of Newton's method to their feet on the ground, and the least cosine of the angle by which
+#: the ground may turn beneath an obstacle, of 45 degrees: a steeper wall would be longer than its size by more than 11 %.
+SIDES, LOWERED, STEEPEST = 48, 10, 0.7
+
+#: Shares of the size of an obstacle at which the ground beneath it is examined.
+SHARES = np.arange(1, 65) / 64
+
 #: A place of the rear axle and a heading, in the ground's axes, as one array.
 Pose: TypeAlias = Float[Array, " components"]
 
@@ -456,32 +481,55 @@ def pose_of(scene: Scene, place: tuple[ArrayLike, ...], heading: Float[Array, ""
 
 
 @eqx.filter_jit
-def poses_at(
-    surface: AbstractSurface, tangent: Frame | None, points: Float[Array | np.ndarray, "n 3"]
-) -> Float[Array, "n components"]:
-    """The poses of points and headings on the map of a problem. **Arguments:** `tangent`: that of the `Problem`."""
+def poses_at(surface: AbstractSurface, points: Float[Array | np.ndarray, "n 3"]) -> Float[Array, "n components"]:
+    """The poses of points and headings (x, y, angle), where the ground names its places x and y."""
 
-    def position(point: Float[Array, " 2"]) -> Float[Array, " axes"]:
-        if tangent is None:
-            place = surface.charted((point[0], point[1]))[0]
-        else:
-            origin, east, north, _ = tangent
-            place = surface.nearest(padded(origin + point[0] * east + point[1] * north))
-        return jnp.stack(place[: surface.axes])
+    along = jnp.stack([jnp.cos(points[:, 2]), jnp.sin(points[:, 2])], axis=1)
+    place, along = jax.jvp(
+        lambda at: jnp.stack(surface.charted(tuple(at.T))[0][: surface.axes], axis=1),
+        (jnp.asarray(points[:, :2]),),
+        (along,),
+    )
+    return jnp.concatenate([place, along / jnp.sqrt(jnp.sum(along**2, axis=1, keepdims=True))], axis=1)
 
-    def pose(point):
-        place, along = jax.jvp(position, (point[:2],), (jnp.stack([jnp.cos(point[2]), jnp.sin(point[2])]),))
-        return jnp.concatenate([place, along / jnp.sqrt(jnp.sum(along**2))])
 
-    return jax.vmap(pose)(points)
+@eqx.filter_jit
+def walked(surface: AbstractSurface, frame: Frame, ways: Float[Array | np.ndarray, "n 2"]) -> Float[Array, "n 3"]:
+    """The places [m] to which straight ways on the ground lead. **Arguments:** `frame`: that of their common start;
+    `ways`: their lengths [m] along its first two axes."""
+    step = jnp.asarray(ways / STEPS @ frame[1:3]).T
+
+    def walk(_: int, way: tuple[Numbers, Numbers]) -> tuple[Numbers, Numbers]:
+        # The step turns with the normal.
+        place, step = surface.onto(tuple(way[0] + way[1])), tuple(way[1])
+        before, after = surface.normal(tuple(way[0])), surface.normal(place)
+        turn = scale(dot(step, after) / (1.0 + dot(before, after)), sum_vectors(before, after))
+        return jnp.stack(place), jnp.stack(difference(step, turn))
+
+    start = jnp.broadcast_to(frame[0][:, None], step.shape)
+    return jax.lax.fori_loop(0, STEPS, walk, (start, step))[0].T
+
+
+@eqx.filter_jit
+def feet(
+    surface: AbstractSurface, frame: Frame, points: Float[Array | np.ndarray, "n 2"]
+) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
+    """The points [m] of the ground above or below those of an obstacle's plane, and the cosines of the angles by which the
+    ground is turned there; NaN where there is none."""
+    up, cosine = frame[3], jnp.ones(len(points))
+    side, foot = dot(surface.normal(tuple(frame[0])), tuple(up)), (frame[0] + points @ frame[1:3]).T
+    for _ in range(LOWERED):
+        foot = foot - up[:, None] * (side * surface.offset(tuple(foot)) / jnp.maximum(cosine, 0.5 * STEEPEST))
+        cosine = side * dot(surface.normal(tuple(foot)), tuple(up))
+    return foot.T, jnp.where(jnp.abs(surface.offset(tuple(foot))) < 1e-6 * jnp.abs(points).max(), cosine, jnp.nan)
 
 
 class Problem(eqx.Module):
     """A planning problem, as the user states it. `t1` is the duration [s] of the drive, or, `in_haste`, where the time is
     minimised, the longest one.
 
-    Paths are searched on a flat map of the ground: x and y where the ground names its places so, and otherwise a tangent
-    plane.
+    Paths are searched on a flat map of the ground: x and y where the ground names its places so, and otherwise
+    straight ways from a middle: each point stands for the place to which the way in this direction, of this length, leads.
     """
 
     scene: Scene
@@ -516,32 +564,82 @@ class Problem(eqx.Module):
         )
         return np.array([place, heading, left, cross(heading, left)], dtype=float)
 
+    @property
+    def turns(self) -> tuple[float, float, float]:
+        """The least and the greatest curvature [1/m] of a path, by the limits of the steering angle, and the distance [m]
+        from the start, the goal and the obstacles that it may need to turn round."""
+        low, high = (float(np.tan(angle[0])) for angle in self.limits.arrays(LIMIT_RESERVE))
+        low, high = low / float(self.scene.body.wheelbase), high / float(self.scene.body.wheelbase)
+        radius = 1.0 / (min(SEARCH_CURVATURES) * max(-low, high))
+        return low, high, max(2.5 * float(self.footprint.length), TURNING_SPACE * radius)
+
     @functools.cached_property
-    def tangent(self) -> Float[np.ndarray, "4 3"] | None:
-        """The frame of the plane whose points stand for the nearest ones of the ground; `None` if the ground names its places x
-        and y."""
-        surface, axes = self.scene.surface, self.scene.surface.axes
+    def map(self) -> tuple[float, Float[np.ndarray, "points points 3 3"]] | None:
+        """A table of the map: the distance [m] of its points, and for each of them its place [m] and the derivatives of the
+        place by x and y; `None` if the ground names its places x and y."""
+        surface = self.scene.surface
         if tuple(surface.coordinates) == FROM_ABOVE:
             return None
-        middle = (self.start_pose[:axes] + self.goal_pose[:axes]) / 2.0
-        return self.frame(surface.place_at(surface.nearest(padded(middle))), 0.0)
+        ends = np.array([self.start_pose, self.goal_pose])[:, :3]
+        middle = self.frame(surface.place_at(surface.nearest(tuple(ends.mean(axis=0)))), 0.0)
+        middle = middle if np.all(np.isfinite(middle)) else self.frame(self.launch.place, 0.0)
+        places = np.concatenate([ends, *(frame[0] + outline_of(part) @ frame[1:3] for part, frame in self.standing)])
+        # Along a sphere, no place is further than half a circle about the straight line to it.
+        reach = np.pi / 2.0 * np.linalg.norm(places - middle[0], axis=1).max() + self.turns[2]
+        spacing, number = float(reach) / MAPPED, np.arange(-MAPPED, MAPPED + 1)
+        ways = spacing * np.stack(np.meshgrid(number, number, indexing="ij"), axis=-1)
+        places = np.asarray(walked(surface, middle, ways.reshape(-1, 2))).reshape(*ways.shape[:2], 3)
+        return (spacing, np.stack([places, *np.gradient(places, spacing, axis=(0, 1))], axis=-2))
 
     def point(self, pose: Float[Array | np.ndarray, " components"]) -> Float[np.ndarray, " 3"]:
-        """The point and the heading (x, y, angle) on the map of a pose."""
-        axes = self.scene.surface.axes
-        place, heading = np.asarray(pose[:axes]), np.asarray(pose[axes:])
-        if self.tangent is not None:
-            plane = self.tangent[1:3]
-            place, heading = plane @ (place - self.tangent[0]), plane @ heading
-        return np.array([place[0], place[1], np.arctan2(heading[1], heading[0])])
+        """The point and the heading (x, y, angle) of a pose on the map, the nearest to its middle if there are several."""
+        (place, heading), corner = np.asarray(pose).reshape(2, -1), np.zeros(2)
+        if self.map is not None:
+            spacing, frames = self.map
+            away = np.linalg.norm(frames[:, :, 0] - place, axis=-1)
+            numbers = np.argwhere(away <= max(2.0 * away.min(), 0.5 * spacing))
+            number = numbers[np.argmin(np.linalg.norm(numbers - MAPPED, axis=-1))]
+            origin, *slopes = frames[tuple(number)]
+            corner, inverse = spacing * (number - MAPPED), np.linalg.pinv(slopes)
+            place, heading = (place - origin) @ inverse, heading @ inverse
+        return np.array([*(place[:2] + corner), np.arctan2(heading[1], heading[0])])
+
+    def seen(self, points: Float[np.ndarray, "*n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The places, the headings and the directions to the left of points and headings on the map, seen from above or in
+        space, as obstacles are."""
+        points, cosine, sine = points[..., :2], np.cos(points[..., 2:]), np.sin(points[..., 2:])
+        if self.map is None:
+            return points, np.concatenate([cosine, sine], axis=-1), np.concatenate([-sine, cosine], axis=-1)
+        spacing, frames = self.map
+        number = np.rint(points / spacing).astype(int).clip(-MAPPED, MAPPED)
+        origin, by_x, by_y = np.moveaxis(frames[tuple(np.moveaxis(number + MAPPED, -1, 0))], -2, 0)
+        x, y = np.moveaxis(points - spacing * number, -1, 0)[..., None]
+        heading = cosine * by_x + sine * by_y
+        left = np.cross(np.cross(by_x, by_y), heading)
+        units = (part / np.linalg.norm(part, axis=-1, keepdims=True) for part in (heading, left))
+        return origin + x * by_x + y * by_y, *units
 
     @functools.cached_property
     def standing(self) -> list[tuple[Box | Disc, Float[np.ndarray, "4 3"]]]:
         """Each obstacle in the coordinates of its frame, and this frame."""
-        if self.tangent is not None:
-            return [(moved(part, (0.0, 0.0), 0.0), self.frame(part.centre, part.angle)) for part in self.obstacles]
-        places = [np.asarray(pose_of(self.scene, part.centre, jnp.zeros(())))[:2] for part in self.obstacles]
-        return [(moved(part, place, part.angle), ABOVE) for part, place in zip(self.obstacles, places, strict=True)]
+        standing, is_above = [], tuple(self.scene.surface.coordinates) == FROM_ABOVE
+        for part in self.obstacles:
+            place, angle, frame = np.zeros(2), 0.0, ABOVE
+            if is_above:
+                place, angle = np.asarray(pose_of(self.scene, part.centre, jnp.zeros(())))[:2], part.angle
+            else:
+                frame = self.frame(part.centre, part.angle)
+            standing.append(
+                (Box(place, part.size, angle) if isinstance(part, Box) else Disc(place, part.radius), frame)
+            )
+        return standing
+
+    @property
+    def outlines(self) -> Iterator[Vector]:
+        """The outline of each obstacle on the ground [m], in the ground's axes."""
+        for part, frame in self.standing:
+            line, surface = outline_of(part), self.scene.surface
+            yield surface.charted(tuple(line.T))[0] if frame is ABOVE else tuple(feet(surface, frame, line)[0].T)
 
     def gaps(self, corners: Float[np.ndarray, "footprints 4 axes"]) -> Float[np.ndarray, "footprints obstacles"]:
         """The exact distance [m] of footprints from every obstacle, in its tangent plane or along its normal; negative for an
@@ -612,10 +710,23 @@ def checked_problem(
         raise ValueError(
             f"goal: place = {shown(goal.place)} is too far: {away}; plan a long way in stages, goal by goal"
         )
+    for number, (part, frame) in enumerate(problem.standing):
+        if frame is ABOVE:
+            continue
+        parts = np.multiply.outer(SHARES, outline_of(part))
+        cosines = np.asarray(feet(scene.surface, frame, parts.reshape(-1, 2))[1]).reshape(len(SHARES), -1)
+        steep = ~np.all(cosines >= STEEPEST, axis=1)
+        if steep.any():
+            name, size = ("radius", part.radius) if isinstance(part, Disc) else ("size", max(part.size))
+            most = SHARES[max(np.argmax(steep) - 1, 0)] * float(size)
+            raise ValueError(
+                f"obstacles[{number}]: {name} = {float(size):g} m must be at most {most:.2g} m at this place, because "
+                "obstacles are flat, and the ground turns by more than 45 degrees beneath it: use several smaller ones"
+            )
     why = "limits; no plan can keep a limit that is broken at its ends"
     for owner, part, name in (("launch", launch, "steering"), ("launch", launch, "speed"), ("goal", goal, "speed")):
         low, high = limits.ranges().get(name, (None, None))
-        require(getattr(part, name), f"{owner}.{name}", at_least=low, at_most=high, why=why)
+        require_all([Bound(getattr(part, name), f"{owner}.{name}", at_least=low, at_most=high, why=why)])
     for name, gaps in problem.gaps_at_ends.items():
         if gaps.min(initial=np.inf) <= 0.0:
             nearest = int(np.argmin(gaps))

@@ -15,8 +15,10 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from .problem import ABOVE, FAR, Numbers, Obstacles, Problem, moved, poses_at
-from .transcription import LIMIT_RESERVE, ORDER
+from nonholonomic.geometry import Plane
+
+from .problem import MAPPED, SEARCH_CURVATURES, Numbers, Obstacles, Problem, poses_at
+from .transcription import ORDER
 
 # The region of a search, and what the stroller may do there.
 
@@ -28,10 +30,6 @@ CURVATURES, MOST_TURN = (-1.0, -0.5, 0.0, 0.5, 1.0), 0.5
 
 #: Points of an arc that must be free, for each step of a grid cell and a half.
 SAMPLES = 3
-
-#: Distance from the start, the goal and the obstacles [least turning radii] that a path may need to turn round: three circles
-#: that touch each other reach as far.
-TURNING_SPACE = 4.0
 
 #: First arcs from the start, in units of an ordinary step, and shortcuts of a batch that are examined.
 FIRST_ARCS, EXAMINED = 12, 8
@@ -101,31 +99,26 @@ class Search:
 
     def __init__(self, problem: Problem, share: float, costs: Costs):
         """**Arguments:** `share`: share of the curvatures, which the limits of the steering angle allow, that is used."""
-        self.costs, self.has_heading = costs, problem.goal.heading is not None
+        self.problem, self.costs, self.has_heading = problem, costs, problem.goal.heading is not None
         start, self.goal = problem.point(problem.start_pose), problem.point(problem.goal_pose)
-        standing = problem.standing
-        if problem.tangent is not None:
-            # The map shows one side of a closed ground.
-            standing = [pair for pair in standing if pair[1][3] @ problem.tangent[3] > 0.0]
-            points = [problem.point(frame[:2].ravel()) for _, frame in standing]
-            standing = [(moved(part, at[:2], at[2]), ABOVE) for (part, _), at in zip(standing, points, strict=True)]
         # NumPy would otherwise dispatch every operation with these to JAX.
-        obstacles, footprint = jax.tree.map(np.asarray, (Obstacles.of(standing), problem.footprint))
+        obstacles, footprint = jax.tree.map(np.asarray, (Obstacles.of(problem.standing, 1), problem.footprint))
         self.obstacles, self.footprint = obstacles, footprint
-        angles = problem.limits.arrays(LIMIT_RESERVE)
-        low, high = (float(np.tan(angle[0])) / float(problem.scene.body.wheelbase) for angle in angles)
+        low, high, space = problem.turns
         self.least, self.greatest = max(low, share * low), min(high, share * high)
         self.sharpest = max(-self.least, self.greatest)
         slowest, fastest = problem.limits.ranges().get("speed", (-np.inf, np.inf))
         self.directions = tuple(sign for sign, speed in ((1.0, fastest), (-1.0, -slowest)) if speed > 0.0)
-        # A region around the start, the goal and all obstacles, with space to turn, which is the same for all shares.
-        boxes, centres, radii = obstacles.boxes.reshape(-1, 2), obstacles.centres, obstacles.radii[:, None]
-        points = np.concatenate([boxes, centres - radii, centres + radii])
-        points = np.concatenate([[start[:2], self.goal[:2]], points[np.abs(points).max(axis=1) < 0.1 * FAR]])
-        radius = 1.0 / (min(SEARCH_CURVATURES) * max(-low, high))
-        reach = max(2.5 * float(footprint.length), TURNING_SPACE * radius)
-        self.low = points.min(axis=0) - reach
-        self.size = points.max(axis=0) + reach - self.low
+        # The whole map, or a region around the start, the goal and all obstacles, with space to turn.
+        if problem.map is None:
+            boxes, centres, radii = obstacles.boxes.reshape(-1, 2), obstacles.centres, obstacles.radii[:, None]
+            points = np.concatenate([boxes, centres - radii, centres + radii])
+            points = np.concatenate([[start[:2], self.goal[:2]], points])
+            self.low, high = points.min(axis=0) - space, points.max(axis=0) + space
+            self.size = high - self.low
+        else:
+            self.low = np.full(2, -MAPPED * problem.map[0])
+            self.size = -2.0 * self.low
         self.cell = max(0.2 * float(footprint.length), float(self.size.max()) / MOST_CELLS)
         nx, ny = np.ceil(self.size / self.cell).astype(int) + 1
         self.shape = (int(nx), int(ny))
@@ -297,19 +290,20 @@ class Search:
         """Whether the footprint is inside the region and keeps its distance from all obstacles."""
         place = poses[..., :2] - self.low
         free = np.all((place >= 0.0) & (place <= self.size), axis=-1)
-        forward = np.stack([np.cos(poses[..., 2]), np.sin(poses[..., 2])], axis=-1)
+        place, forward, left = self.problem.seen(poses)
         length = float(self.footprint.length)
-        centre = poses[..., :2] + (length / 2.0 - float(self.footprint.rear)) * forward
+        centre = place + (length / 2.0 - float(self.footprint.rear)) * forward
         # Only where the circle about the footprint may touch an obstacle, its corners are looked at.
         close = self.distance(centre) < 0.5 * np.hypot(length, float(self.footprint.width)) + self.costs.clearance
-        forward = forward[close]
-        left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
-        corners = self.footprint.corners(poses[close][:, :2], forward, left)
+        corners = self.footprint.corners(place[close], forward[close], left[close])
         free[close] &= self.obstacles.gaps(corners).min(axis=-1, initial=np.inf) > self.costs.clearance
         return free
 
-    def distance(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """A lower bound [m] of the distance of points from all obstacles, exact outside of them."""
+    def distance(self, points: Float[np.ndarray, "*n axes"]) -> Float[np.ndarray, "*n"]:
+        """A lower bound [m] of the distance of points from all obstacles: seen from above, exact outside of them, and in space,
+        0 inside."""
+        if self.problem.map is not None:
+            return self.obstacles.gaps(np.repeat(points[..., None, :], 4, axis=-2)).min(axis=-1, initial=np.inf)
         boxes = self.obstacles.boxes
         side = boxes[:, 0] - boxes[:, 3]
         length, width = np.linalg.norm(side, axis=-1), np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=-1)
@@ -326,7 +320,9 @@ class Search:
         nx, ny = self.shape
         points = self.low + self.cell * (np.moveaxis(np.indices((nx, ny)), 0, -1) + 0.5)
         half = 0.5 * float(self.footprint.width) + self.costs.clearance
-        free = self.distance(points) > half - 0.7 * self.cell
+        # In space, an obstacle may see the disc as a line.
+        least = half - 0.7 * self.cell if self.problem.map is None else 0.0
+        free = self.distance(self.problem.seen(np.pad(points, ((0, 0), (0, 0), (0, 1))))[0]) > least
         number = np.arange(nx * ny).reshape(nx, ny)
         links = []
         for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
@@ -345,10 +341,6 @@ class Search:
 
 #: Number of intervals of a plan.
 INTERVALS = 64
-
-#: Curvature of the arcs of the searches for neighbouring lanes, in units of the greatest one: less, because the fork takes time
-#: to turn, and nearly all, because a somewhat wider turn may need a detour.
-SEARCH_CURVATURES = (0.98, 0.85)
 
 #: Length of the shortest drive that is expected, in units of the path of a search, which consists of arcs.
 OPTIMISTIC = 0.8
@@ -383,6 +375,9 @@ def paths_of(problem: Problem, costs: list[Costs]) -> tuple[list[Path], str | No
     """A path for each of several prices, straight to the goal where the search finds none; and a reason, in words, why
     none can be driven in time, if there is one."""
     start, goal = problem.point(problem.start_pose), problem.point(problem.goal_pose)
+    approximate = "; the search is approximate on this ground: it may be wrong"
+    if isinstance(problem.scene.surface, Plane):
+        approximate = ""
     results = [Search(problem, SEARCH_CURVATURES[lane % 2], cost).run() for lane, cost in enumerate(costs)]
     paths = [path for path, _, _ in results if path is not None]
     if not paths:
@@ -393,11 +388,12 @@ def paths_of(problem: Problem, costs: list[Costs]) -> tuple[list[Path], str | No
         poses = np.stack([start, goal])
         poses[:, 2] = np.arctan2(away[1], away[0])
         straight = Path(poses, np.ones(1), np.zeros(1), np.array([max(float(np.hypot(*away)), 1e-3)]))
-        return [straight] * len(costs), f"{what}; the nearest ended {nearest:.2g} m from the goal"
+        return [straight] * len(costs), f"{what}; the nearest ended {nearest:.2g} m from the goal{approximate}"
     low, high = problem.limits.ranges().get("speed", (-np.inf, np.inf))
     way, fastest, reason = min(float(path.length.sum()) for path in paths), max(-low, high), None
     if OPTIMISTIC * way > fastest * problem.t1:
         reason = f"the shortest path that was found, {way:.3g} m, takes {way / fastest:.3g} s at the limit of the speed"
+        reason += approximate
     return [path or paths[0] for path, _, _ in results], reason
 
 
@@ -414,8 +410,8 @@ def guess_of(problem: Problem, path: Path) -> tuple[Float[np.ndarray, "rows unkn
         slowest = [way / accelerations[0], way / accelerations[1], body.steering_inertia / most.get("torque", np.inf)]
         t1 = max(way / most.get("speed", np.inf), 2.0 * float(np.sqrt(max(slowest))))
     points, splines = timed(path, INTERVALS + 1, t1, wheelbase)
-    poses = np.asarray(poses_at(scene.surface, problem.tangent, points))
-    poses = np.concatenate([poses, poses[-1:], poses[-1:]])
+    lifted = poses_at(scene.surface, points) if problem.map is None else np.hstack(problem.seen(points)[:2])
+    poses = np.asarray(lifted)[[*range(len(lifted)), -1, -1]]
     return np.concatenate([poses, np.pad(splines, ((1, ORDER - 3), (0, 0)), mode="edge")], axis=1), t1
 
 

@@ -22,7 +22,7 @@ from nonholonomic.geometry import AbstractSurface, Vector, add, cross, differenc
 
 from ..model.dynamics import Dynamics, padded
 from ..model.input import Motion
-from .problem import Footprint, Obstacles, Pose, Problem, corners_of, frame_of
+from .problem import LIMIT_RESERVE, Footprint, Obstacles, Pose, Problem, corners_of, frame_of
 
 #: Numbers in JAX; and coefficients of the splines of the steering angle and of the front wheel's speed, all or those of an
 #: interval.
@@ -131,10 +131,6 @@ def interpolate(values: Float[np.ndarray, "knots *n"]) -> Float[np.ndarray, "coe
 #: Number of steps of the Runge-Kutta method in an interval; constraints hold at the start of each step, and at the end of the
 #: drive.
 STEPS = 3
-
-#: Share of every limit's range to keep in reserve at first: the check examines the ride between the points at which the
-#: optimiser looks.
-LIMIT_RESERVE = 0.003
 
 #: Smallest normal force, in units of the weight.
 LEAST_CONTACT = 0.02

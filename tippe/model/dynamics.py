@@ -13,23 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import least, stored, stored_with_tangents
-from nonholonomic.geometry import (
-    AbstractFrame,
-    Component,
-    PlaneFrame,
-    Tangent,
-    Vector,
-    add,
-    cross,
-    dot,
-    multiply,
-    planar_length,
-    rate_in_frame,
-    scale,
-    stacked,
-    subtract,
-    sum_vectors,
-)
+from nonholonomic.geometry import AbstractFrame, Component, PlaneFrame, Tangent, Vector, add, cross, dot
+from nonholonomic.geometry.vector import multiply, planar_length, rate_in_frame, scale, stacked, subtract, sum_vectors
 from nonholonomic.integration import Components, States
 from nonholonomic.integration.problem import Status
 

@@ -22,23 +22,8 @@ from jaxtyping import Array, Float
 from nonholonomic.compilation.components import TooLarge, by_components
 from nonholonomic.compilation.tracing import with_own_numbers
 from nonholonomic.compilation.xla_cpu import stored
-from nonholonomic.geometry import (
-    AbstractFrame,
-    Component,
-    FrameMotion,
-    Place,
-    PlaneFrame,
-    Tangent,
-    Vector,
-    add,
-    cross,
-    dot,
-    multiply,
-    rate_in_frame,
-    scale,
-    subtract,
-    sum_vectors,
-)
+from nonholonomic.geometry import AbstractFrame, Component, FrameMotion, Place, PlaneFrame, Tangent, Vector
+from nonholonomic.geometry.vector import add, cross, dot, multiply, rate_in_frame, scale, subtract, sum_vectors
 from nonholonomic.integration import Components, States
 from nonholonomic.text import shown
 from nonholonomic.validation import UNTRACEABLE, ArrayOrList, Bound, Bounded, as_number, is_traced

@@ -10,25 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import (
-    AbstractFrame,
-    AbstractSurface,
-    Component,
-    Cylinder,
-    Plane,
-    PlaneFrame,
-    Sphere,
-    Torus,
-    Vector,
-    cross,
-    dot,
-    frame_of,
-    none_if_zero,
-    place_named,
-    scale,
-    sum_vectors,
-)
+from nonholonomic.geometry import AbstractSurface, Component, Cylinder, Plane, Sphere, Torus, Vector
+from nonholonomic.geometry.frames import AbstractFrame, PlaneFrame, frame_of, place_named
 from nonholonomic.geometry.surface import as_surface
+from nonholonomic.geometry.vector import cross, dot, none_if_zero, scale, sum_vectors
 from nonholonomic.integration import Components, States
 from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import likely_fix, shown, suspected_gravity

@@ -17,18 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup, least
-from nonholonomic.geometry import (
-    CarriedFrame,
-    Component,
-    Vector,
-    add,
-    dot,
-    scale,
-    stacked,
-    subtract,
-    sum_vectors,
-    tangents,
-)
+from nonholonomic.geometry import CarriedFrame, Component, Vector
+from nonholonomic.geometry.vector import add, dot, scale, stacked, subtract, sum_vectors, tangents
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import AbstractPassive, AbstractProblem, Components, Lanes, States
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
