@@ -308,8 +308,8 @@ def distinguishing_labels(
     one role, such as the scenes, one per run; `unit`: units for their numbers, as for `in_unit`; `longest`: the number of
     characters that a label may have, `None` for any.
 
-    **Returns:** the labels; one that would be longer ends in "…". If nothing differs, a label is the whole start; equal labels
-    are numbered.
+    **Returns:** the labels; one of several that would be longer ends in "…". If nothing differs, a label is the whole start;
+    equal labels are numbered.
     """
     differing = [k for k, texts in enumerate(zip(*starts, strict=True)) if len(set(texts)) > 1]
     parts = [[start[k] for k in differing] for start in starts]
@@ -317,7 +317,7 @@ def distinguishing_labels(
         parts = [part + difference for part, difference in zip(parts, differences(group, unit), strict=True)]
     names = [", ".join(part or start) for part, start in zip(parts, starts, strict=True)]
     for k, name in enumerate(names):
-        if longest is not None and len(name) > longest:
+        if longest is not None and len(name) > longest and len(names) > 1:
             # Cut after the last part that is whole, if any is.
             end = name.rfind(", ", 0, longest + 2)
             names[k] = f"{name[: longest if end < 0 else end]}, …"

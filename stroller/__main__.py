@@ -29,7 +29,7 @@ from .planning.plan import Plan, plan, planned_stage
 from .planning.problem import Box, Goal, Limits
 from .runs.model import simulate
 from .runs.trajectory import Trajectory, table_of
-from .runs.view import draw_rides, grouped
+from .runs.view import grouped
 
 RIDES = ("without friction", "with friction")
 
@@ -45,9 +45,6 @@ AUDIT = "audit"
 
 #: The name of the page.
 PAGE = "index.html"
-
-#: Tolerances of the rides that show how the energy residual depends on the tolerance.
-TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 
 
 class Ground(NamedTuple):
@@ -180,17 +177,6 @@ def audited(options: argparse.Namespace, helm: Helm, ground: str) -> tuple[dict[
     return rides, lines
 
 
-def tolerance_curve(options: argparse.Namespace, helm: Helm) -> tuple[None, list[str]]:
-    """Lines with the largest energy residual over the tolerance of Dopri8, for the last ride."""
-    (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
-    lines = ["", f"Dopri8 {ground}, {ride}: largest residual [J] of energy minus work, by tolerance"]
-    for tolerance in TOLERANCES:
-        run = simulate(scene, launch, options.t1, helm, tolerance=tolerance)
-        residual = float(jnp.max(jnp.abs(run.energy_residual)))
-        lines.append(f"  {tolerance:7.0e}  {residual:8.1e}  in {int(run.stats.steps)} steps")
-    return None, lines
-
-
 def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[views.Stage]:
     """The stages of the page: the plan, and each ground with its rides."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
@@ -210,7 +196,6 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
     grounds = dict.fromkeys(ground for ground, _ in scenes(options))
     helm = Helm(options.force, options.steer, options.period)
     jobs = [partial(parked, options), *(partial(audited, options, helm, ground) for ground in grounds)]
-    jobs.append(partial(tolerance_curve, options, helm))
     results, texts = [], []
     # Compile in parallel, because the compiler uses little more than one core.
     with Progress(len(jobs), "job") as display, ThreadPoolExecutor(2) as threads:
@@ -222,7 +207,7 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
             with display.aside():
                 print(texts[-1], flush=True)
             display.advance(1)
-    parking, *rides_by_ground, _ = results
+    parking, *rides_by_ground = results
     rides = {name: run for runs in rides_by_ground for name, run in runs.items()}
     names = ["_".join(name).replace(" ", "_") for name in rides]
     request = {name: value for name, value in vars(options).items() if name != "out"}
@@ -230,9 +215,12 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
         table_of(list(rides.values()), names, request | {"ride": names}).save(options.out / "rides.h5")
         files, pictures = ["rides.h5"], []
         if views.can_draw():
+            first, *others = rides.values()
+            labels = [", ".join(name) for name in rides]
+            curves = first.plot("speed", "energy", "side_force", others=others, label=labels)
             for heading, name, figure in (
                 ("Parking", "parked.png", parking.plot()),
-                ("Paths, speeds, energies, side forces", "rides.png", draw_rides(rides)),
+                ("Speeds, energies, side forces", "rides.png", curves),
             ):
                 figure.savefig(options.out / name, dpi=110)
                 files.append(name)

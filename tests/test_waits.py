@@ -15,7 +15,6 @@ import tippe
 from nonholonomic.identification import Identification, LogDensity, Measurements, identify
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Tabular
-from nonholonomic.views import Viewable
 
 pytestmark = pytest.mark.oldest
 
@@ -74,7 +73,7 @@ def waits(*_, **__):
     raise Enough
 
 
-class SlowRun(Viewable, Tabular):
+class SlowRun(Tabular):
     """A run that takes long to describe for a page."""
 
     stages = waits

@@ -22,10 +22,11 @@ from nonholonomic.terminal import Progress
 from nonholonomic.validation import replacing, require_folder
 from nonholonomic.views.explore import live_page
 
-from . import paper, presets, steady
+from . import paper, steady
 from .friction import Coulomb
 from .model.scene import Launch, Scene
 from .modes.problems import INVERTED
+from .presets import TOPS
 from .runs.model import TopModel
 from .runs.verbs import inversion_table
 from .runs.view import Panel, draw_launches, page_of_launch, stage_at_start, theta_over_time
@@ -33,8 +34,6 @@ from .runs.view import Panel, draw_launches, page_of_launch, stage_at_start, the
 # Only for type checkers: matplotlib is optional.
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
 #: The arenas, which name the files of the tables.
 ARENAS = ("plane", "cylinder")

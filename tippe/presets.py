@@ -99,5 +99,8 @@ def leine_glocker() -> Top:
     return Top(0.006, 0.015, 0.003, 8e-7, 7e-7, Stem(0.005, 0.016))
 
 
+#: The tops by their names.
+TOPS = {top.__name__: top for top in (wooden, rutstam, cohen, leine_glocker)}
+
 wooden_top, rutstam_top, cohen_top, leine_glocker_top = wooden, rutstam, cohen, leine_glocker
 classroom_scene = classroom

@@ -25,7 +25,7 @@ from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
-from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, Viewable, stages_of
+from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stages_of
 from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
 from ..views.stage import Draw, Drawing, Parts, Wheel, curves_in, meshes_of, of_grid
 from .model import AbstractModel, Names, Sliders, model_of, run_of
@@ -53,6 +53,7 @@ def explore(
     unit: Unit = None,
     jumps: object = None,
     draw: Draw = None,
+    label: str | None = None,
 ) -> Page:
     """Make a page with sliders that simulates a run in the browser while you move a slider.
 
@@ -70,6 +71,7 @@ def explore(
     - `t1`: horizon [s].
     - `unit`: unit of the curves, such as "deg" for all angles, or several, such as ("deg", "cm").
     - `draw`: for your own system, as for `Trajectory.view`; a slider moves the parts, but cannot change their size.
+    - `label`: title of the page.
 
     **Returns:** a `Page`, with its `html`.
 
@@ -100,7 +102,7 @@ def explore(
     ```
     """
     model, unit = model_of(system, start, None, input, jumps), unit or getattr(start, "shown_in", None)
-    return explore_model(drawn_by(model, draw), path, sliders, float(t1), unit)
+    return explore_model(drawn_by(model, draw), path, sliders, float(t1), unit, label)
 
 
 def drawn_by(model: Any, draw: Draw) -> Any:
@@ -114,7 +116,7 @@ def drawn_by(model: Any, draw: Draw) -> Any:
     return dataclasses.replace(model, **{"draw": draw})
 
 
-def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: float, unit: Unit) -> Page:
+def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: float, unit: Unit, label: Any) -> Page:
     """The page of a model. **Arguments:** as for `explore`."""
     if path is not None:
         require_file(path, "path", ".html", ".htm")
@@ -123,7 +125,7 @@ def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: 
     model.check()
     live, stage = page_of(model, sliders, t1)
     (stage,) = curves_in([stage], unit)
-    html_page = live_page(live, stage)
+    html_page = live_page(live if label is None else live._replace(title=label), stage)
     if path is not None:
         html_page.save(path)
     return html_page
@@ -404,7 +406,7 @@ REASONS = {
 }
 
 
-class AbstractRun(Viewable, Tabular, eqx.Module):
+class AbstractRun(Tabular, eqx.Module):
     """A run of any model at its times `t`, the first axis of its arrays; a batch has an axis before it."""
 
     #: The model of the run, and the end of the runs on its page [s].
@@ -417,14 +419,21 @@ class AbstractRun(Viewable, Tabular, eqx.Module):
     def in_words(self) -> str:
         """The text of a single run."""
 
-    def explore(self, path: Any = None, sliders: Sliders | None = None, unit: Unit = None, draw: Draw = None) -> Page:
+    def explore(
+        self,
+        path: Any = None,
+        sliders: Sliders | None = None,
+        unit: Unit = None,
+        draw: Draw = None,
+        label: str | None = None,
+    ) -> Page:
         """A page with sliders that simulates the run in the browser, until its end; see `nonholonomic.explore`.
 
         **Raises:** as for `nonholonomic.explore`, and `ValueError` for a batch of runs.
         """
         require_one_run(self, "explore", "")
         model, t1 = self.of_page
-        return explore_model(drawn_by(model, draw), path, sliders, t1, unit or self.unit)
+        return explore_model(drawn_by(model, draw), path, sliders, t1, unit or self.unit, label)
 
     @status_line("reading off")
     def to_table(self) -> Table:

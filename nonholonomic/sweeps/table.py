@@ -16,7 +16,9 @@ from jaxtyping import Int
 from ..terminal import status_line
 from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html
 from ..validation import as_path, replacing, require_package
-from ..views import draw_portrait, draw_series, draw_table, require_others
+from ..views.pages import Viewable, require_labels, require_others
+from ..views.plot import draw_curves, draw_portrait, draw_series, draw_table
+from ..views.stage import curves_in
 from ._store import Stored, contents_of, table_path, write_file
 from .grid import PENDING, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
 
@@ -476,8 +478,8 @@ def run_table(
     return Table(coords, values, units, attributes, {}, inner, long_names)
 
 
-class Tabular(abc.ABC):
-    """A run whose quantities over time are a table, which gives it `to_xarray`, `save` and `portrait`.
+class Tabular(Viewable):
+    """A run whose quantities over time are a table, which gives it `to_xarray`, `save`, `plot` and `portrait`.
 
     **Example:**
 
@@ -492,9 +494,6 @@ class Tabular(abc.ABC):
 
     #: The names that a message for an unknown attribute lists before the quantities; the ordinary message lists none.
     readable: ClassVar[tuple[str, ...]] = ()
-
-    #: The units in which pictures show the numbers of the run, unless others are asked for.
-    unit: ClassVar[str | Sequence[str] | None] = None
 
     #: The quantities that `run[name]` returns.
     quantities: ClassVar[Mapping[str, Quantity]] = MappingProxyType({})
@@ -538,7 +537,7 @@ class Tabular(abc.ABC):
         return self.to_table()
 
     def labels_of(self, runs: list[Any], unit: str | Sequence[str] | None) -> list[str]:
-        """Labels that tell runs of this kind apart, in units as for `plot`; an empty one for a single run."""
+        """Labels that tell runs of this kind apart, in units as for `plot`; for a single run the title of its picture."""
         return [""] if len(runs) == 1 else [f"run {k + 1}" for k in range(len(runs))]
 
     @status_line("drawing")
@@ -575,13 +574,19 @@ class Tabular(abc.ABC):
             else:
                 quantities, others = (), first
         runs, unit = [self, *require_others(self, others)], unit or self.unit
-        labels = self.labels_of(runs, unit) if label is None else [label] if isinstance(label, str) else label
-        if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
-            raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
-        if not quantities:
-            return self.overview(runs, labels, unit, ax)
-        tables = [run.table_of(quantities).drawn_in(unit, *quantities) for run in runs]
-        return draw_series(tables, quantities, labels, ax)
+        labels = self.labels_of(runs, unit) if label is None else require_labels(label, runs)
+        title, labels = (labels[0], [""]) if label is None and len(runs) == 1 else ("", labels)
+        if quantities:
+            tables = [run.table_of(quantities).drawn_in(unit, *quantities) for run in runs]
+            marks = [tuple((in_unit("s", unit)[1] * time, words) for time, words in run.marks) for run in runs]
+            drawing = draw_series(tables, quantities, labels, marks, ax)
+        elif ax is None:
+            drawing = draw_curves(curves_in(self.stages(runs[1:]), unit), labels)
+        else:
+            raise ValueError(f"ax takes one quantity: name it, as in plot({next(iter(self))!r}, ax=ax)")
+        if ax is None:
+            drawing.figure.suptitle(title, fontsize="medium")
+        return drawing
 
     def portrait(self, x: str | None = None, y: str | None = None, ax: Any = None, unit: Any = None) -> Any:
         """Draw one quantity against another, a phase portrait (needs matplotlib).

@@ -9,15 +9,11 @@ from .pages import can_draw as can_draw
 from .pages import page as page
 from .pages import page_of_job as page_of_job
 from .pages import picture_as_html as picture_as_html
-from .pages import require_others as require_others
 from .pages import run_job as run_job
 from .pages import stages_of as stages_of
 from .pages import table_as_html as table_as_html
 from .pages import without_motion as without_motion
 from .plot import draw_fit as draw_fit
-from .plot import draw_portrait as draw_portrait
-from .plot import draw_series as draw_series
-from .plot import draw_table as draw_table
 from .plot import new_figure as new_figure
 from .stage import COLOURS as COLOURS
 from .stage import DARK as DARK
@@ -30,6 +26,7 @@ from .stage import Box as Box
 from .stage import Curve as Curve
 from .stage import Disc as Disc
 from .stage import Line as Line
+from .stage import Marks as Marks
 from .stage import Mesh as Mesh
 from .stage import Show as Show
 from .stage import Stage as Stage

@@ -79,7 +79,9 @@
     }
     asks.run(values);
     const outcome = asks.read("outcome", values), took = performance.now() - began;
-    const run = recorded(most);
+    const run = recorded(most), word = words[outcome[0]] || "illegal";
+    const marked = `${word === "inverted" ? "turned over" : word.replace(/_/g, " ")} at ${digits(outcome[1], 3)} s`;
+    run.marks = Number.isFinite(outcome[1]) ? [[outcome[1], marked]] : [];
     tell(outcome, run, took);
     if (player) player.setRun(0, 0, run);
     live.outcome = { status: words[outcome[0]], value: outcome[1], end: run.times[run.times.length - 1] };
@@ -129,9 +131,8 @@
   Object.assign(live, { set, map, values: () => values, simulate, asks, moves, player: () => player });
   set(fromAddress());
   if (window.views) {
-    // Without WebGL, the sliders still compute the result.
-    player = await window.views.ready.catch(() => null);
-    if (player) simulate(3000);
+    player = await window.views.ready;
+    simulate(3000);
   }
   live.ready = true;
 })();

@@ -9,6 +9,9 @@ window.views = window.views || {};
   //: Codec (VP9), and its bits per second for each pixel of a frame.
   const CODEC = "vp09.00.41.08", BITS = 4;
 
+  //: Curves that are folded away.
+  const FOLDED = "details:not([open]) > div";
+
   const size = (node) => node.getBoundingClientRect();
 
   // An empty canvas for the stages and the curves of a player; videos need even numbers of pixels.
@@ -29,7 +32,7 @@ window.views = window.views || {};
     let top = HEAD;
     for (const part of parts) {
       const { top: before, height } = size(part), at = (box) => [box.left - left, box.top - before + top, box.width, box.height];
-      for (const one of part.querySelectorAll("canvas")) pen.drawImage(one, ...at(size(one)));
+      for (const one of part.querySelectorAll("canvas")) if (!one.closest(FOLDED)) pen.drawImage(one, ...at(size(one)));
       for (const key of part.querySelectorAll("i")) {
         pen.fillStyle = getComputedStyle(key).backgroundColor;
         pen.fillRect(...at(size(key)));
@@ -38,7 +41,7 @@ window.views = window.views || {};
       while (texts.nextNode()) {
         range.selectNodeContents(texts.currentNode);
         const holder = texts.currentNode.parentElement, style = getComputedStyle(holder), [x, y, wide, high] = at(size(range));
-        if (!wide || holder.closest(".buttons")) continue;
+        if (!wide || holder.closest(`.buttons, ${FOLDED}`)) continue;
         if (holder.matches(".name")) { pen.fillStyle = style.backgroundColor; pen.fillRect(...at(size(holder))); }
         Object.assign(pen, { fillStyle: style.color, font: `${style.fontWeight} ${style.fontSize} ${style.fontFamily}` });
         pen.fillText(texts.currentNode.data, x, y + high / 2, wide);

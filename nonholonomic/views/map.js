@@ -65,7 +65,7 @@ function makeMap(box, live, integrator, choose) {
     drawing = true;
     requestAnimationFrame(() => { drawing = false; draw(); });
   }
-  const left = 44, bottom = 34;
+  const left = 48, bottom = 38;
   function draw() {
     const ratio = window.devicePixelRatio || 1, [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width) return;
@@ -87,11 +87,11 @@ function makeMap(box, live, integrator, choose) {
       pen.fillRect(x0, y1, x1 - x0, y0 - y1);
     });
     const [first, second] = axes.map((k) => sliders[k]);
-    pen.fillStyle = "#6b7280";
-    pen.font = "11px system-ui, sans-serif";
+    pen.fillStyle = "#23262b";
+    pen.font = "13px system-ui, sans-serif";
     const label = (one) => one.label + (one.unit ? ` [${one.unit}]` : "");
-    pen.textAlign = "left"; pen.fillText(short(first.low), left, height - 19);
-    pen.textAlign = "right"; pen.fillText(short(first.high), left + w, height - 19);
+    pen.textAlign = "left"; pen.fillText(short(first.low), left, height - 22);
+    pen.textAlign = "right"; pen.fillText(short(first.high), left + w, height - 22);
     pen.fillText(short(second.high), left - 5, 11); pen.fillText(short(second.low), left - 5, 2 + h);
     pen.textAlign = "center"; pen.fillText(label(first), left + w / 2, height - 5);
     pen.save(); pen.translate(11, 2 + h / 2); pen.rotate(-Math.PI / 2); pen.fillText(label(second), 0, 0); pen.restore();
@@ -153,6 +153,15 @@ function makeMap(box, live, integrator, choose) {
   }
   canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); pick(event); });
   canvas.addEventListener("pointermove", (event) => { if (event.buttons) pick(event); });
+  // The arrows move the marked run by a cell of the map.
+  canvas.addEventListener("keydown", (event) => {
+    const step = { ArrowRight: [1, 0], ArrowLeft: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    if (!step || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    event.stopPropagation();
+    const moved = (k, part) => values[k] + part * (sliders[k].high - sliders[k].low);
+    choose(values.map((value, k) => k === axes[1] ? moved(k, step[1] / up) : k === axes[0] ? moved(k, step[0] / across) : value));
+  });
   window.addEventListener("resize", redraw);
   setAxes(...axes);
   return { update, results: () => results, done: () => results.filter(Boolean).length === cells.length, cells, at };

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -30,13 +30,7 @@ from jaxtyping import ArrayLike, Float
 from ..terminal import status_line
 from ..text import Unit, require_unit, shown
 from ..validation import replacing, require, require_file, require_increasing, require_package
-from .plot import draw_curves
-from .stage import Arrow, Body, Curve, Draw, Mesh, Show, Stage, Trace, css, curves_in, finite
-
-# Only for type checkers: matplotlib is optional.
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from .stage import Arrow, Body, Curve, Draw, Marks, Mesh, Show, Stage, Trace, css, curves_in, finite
 
 #: Selectable speeds of time.
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -49,8 +43,8 @@ PACKAGE, LIBRARY = "jupyter_threejs_sage", ("static", "r130", "three.min.js")
 
 SCRIPTS = ("stage.js", "strips.js", "film.js", "player.js")
 
-LINES = 0x7C8896
-BACKGROUND = 0xFBFBFA
+#: The name of a run, or a list of one for each run; `None` for names that say what differs.
+Label = str | Sequence[str] | None
 
 #: Opening angle of the camera [deg].
 ANGLE = 35.0
@@ -200,19 +194,12 @@ class _Numbers:
 def _stage(stage: Stage, numbers: _Numbers) -> dict[str, object]:
     """The data of a stage for the script."""
     place, target, follow = view_from(stage)
-    keys = [(stage.arena.spacing, "")] if stage.arena.spacing else []
-    if len(stage.shows) > 1:
-        keys += [(show.name, css(show.colour)) for show in stage.shows]
     return {
         "title": stage.title,
-        "keys": keys,
-        "notes": list(dict.fromkeys(show.note for show in stage.shows if show.note)),
+        "spacing": stage.arena.spacing,
         "follow": follow,
         "camera": (place, target),
         "angle": ANGLE,
-        "size": max(show.size for show in stage.shows),
-        "background": css(BACKGROUND),
-        "lines": css(LINES),
         "arena": numbers.described(stage.arena.mesh)
         | {"lines": [numbers.add(line) for line in stage.arena.lines], "axes": stage.arena.axes},
         "runs": numbers.described(stage.shows),
@@ -351,9 +338,23 @@ class Viewable:
     #: The units in which pictures, pages and texts show the numbers of the run, unless others are asked for.
     unit: ClassVar[Unit] = None
 
-    def stages(self, others: Sequence[Any] = (), overlaid: bool = False, unit: Unit = None) -> list[Stage]:
-        """This run and others as stages; arguments as for `stages_of`."""
-        return stages_of(self, [self, *others], overlaid, unit)
+    #: What pictures and pages mark in the curves.
+    marks: ClassVar[Marks] = ()
+
+    def stages(
+        self, others: Sequence[Any] = (), overlaid: bool = False, unit: Unit = None, label: Label = None
+    ) -> list[Stage]:
+        """This run and others as stages; arguments as for `stages_of` and `view`."""
+        runs, stages = [self, *others], []
+        named = iter(zip(runs, [None] * len(runs) if label is None else require_labels(label, runs), strict=True))
+        for stage in stages_of(self, runs, overlaid, unit):
+            shows = tuple(
+                show._replace(name=text or show.name, marks=run.marks)
+                for show, (run, text) in zip(stage.shows, named, strict=False)
+            )
+            title = stage.title if label is None else "; ".join(show.name for show in shows)
+            stages.append(stage._replace(title=title, shows=shows))
+        return stages
 
     @status_line("drawing")
     def view(
@@ -363,6 +364,7 @@ class Viewable:
         overlaid: bool = False,
         unit: Unit = None,
         draw: Draw = None,
+        label: Label = None,
     ) -> Page:
         """An animated page of the run: body, arena, traces, arrows, and curves over time (needs jupyter-threejs-sage).
 
@@ -377,6 +379,7 @@ class Viewable:
         - `draw`: for your own system, a function `draw(system, t, y)` that returns a list of `views.Box`, `Wheel`, `Disc`,
           `Ball` and `Line`, of sizes that do not change in time; the first part leaves a trace. By default, the first two
           components of the state are a path.
+        - `label`: name of the run; with `others`, a list of one for each run. By default, names say what differs.
 
         **Returns:** a `Page`, with its `html`.
 
@@ -388,7 +391,7 @@ class Viewable:
         require_package("jupyter_threejs_sage", "view", "view")
         if path is not None:
             require_file(path, "path", ".html", ".htm")
-        stages = self._stages(others, overlaid, unit, draw)
+        stages = self._stages(others, overlaid, unit, draw, label)
         html_page = page(stages, "; ".join(stage.title for stage in stages), speed=0.5)
         if path is not None:
             html_page.save(path)
@@ -405,6 +408,7 @@ class Viewable:
         fps: float = 25.0,
         unit: Unit = None,
         draw: Draw = None,
+        label: Label = None,
     ) -> None:
         """Write a film for slides: the page of the run, recorded by Chromium, Chrome or Edge without a window (needs
         jupyter-threejs-sage). It plays the run in real time unless you give a `speed`; the film states time and speed.
@@ -413,7 +417,7 @@ class Viewable:
 
         - `path`: file with a name that ends in .webm.
         - `times`: increasing times [s] of the frames; by default the whole run at the given speed.
-        - `others`, `overlaid`, `unit`, `draw`: as for `view`.
+        - `others`, `overlaid`, `unit`, `draw`, `label`: as for `view`.
         - `speed`: seconds of the run per second of the film, 1 by default; 0.1 is ten times slower than reality. With
           `times`, the speed follows from `times` and `fps`.
         - `fps`: frames per second. Without a graphics card, drawing takes about 0.3 s for each frame.
@@ -442,7 +446,7 @@ class Viewable:
                 "animate needs Chromium, Chrome or Edge, and finds none: install one, for example by `apt install chromium` or "
                 "from google.com/chrome; or open the page of run.view(path) in any browser and press its button Save film"
             )
-        stages = self._stages(others, overlaid, unit, draw)
+        stages = self._stages(others, overlaid, unit, draw, label)
         scripts = [script(RECORD.replace("[REQUEST]", json.dumps(request)))]
         html_page = page(
             stages, "; ".join(stage.title for stage in stages), height=HEIGHT, scripts=scripts, autoplay=False
@@ -450,18 +454,12 @@ class Viewable:
         with replacing(file) as scratch:
             scratch.write_bytes(recorded(html_page, browser))
 
-    def overview(self, runs: Sequence[Any], labels: Sequence[str], unit: Unit, ax: "Axes | None") -> "Figure":
-        """Draw the curves of the page of this run and others over time; arguments as for `plot`."""
-        if ax is not None:
-            raise ValueError("ax takes one quantity: name it, as in plot('energy', ax=ax)")
-        return draw_curves(curves_in(self.stages(runs[1:]), unit), labels)
-
-    def _stages(self, others: Sequence[Any], overlaid: bool, unit: Unit, draw: Draw) -> list[Stage]:
+    def _stages(self, others: Sequence[Any], overlaid: bool, unit: Unit, draw: Draw, label: Label) -> list[Stage]:
         """The stages in a unit, after a check of the unit and that the others are runs of the same package."""
         require_unit(unit)
         runs, unit = [cast(Any, self), *require_others(self, others)], unit or self.unit
         runs = runs if draw is None else [run.drawn_by(draw) for run in runs]
-        return curves_in(runs[0].stages(runs[1:], overlaid, unit), unit)
+        return curves_in(runs[0].stages(runs[1:], overlaid, unit, *([] if label is None else [label])), unit)
 
 
 def require_others(run: object, others: Any) -> Sequence[Any]:
@@ -474,6 +472,14 @@ def require_others(run: object, others: Any) -> Sequence[Any]:
         if stages_of.dispatch(type(other)) is not stages_of.dispatch(type(run)):
             raise ValueError(f"others[{k}] = {shown(other)} must be a run of the same package, as simulate returns it")
     return others
+
+
+def require_labels(label: Label, runs: list[Any]) -> list[str]:
+    """The labels of runs, one for each. **Raises:** `ValueError` if there is another number of them."""
+    labels = [label] if isinstance(label, str) else label
+    if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
+        raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
+    return list(labels)
 
 
 # Films, recorded by a browser.

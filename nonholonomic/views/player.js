@@ -81,8 +81,10 @@ window.views = window.views || {};
       const toggle = (one, on) => one.setAttribute("aria-pressed", String(on));
       toggle(follow, stage.follows); toggle(orbit, false);
       element("b", caption, { textContent: fact.title });
-      for (const note of fact.notes) element("span", caption, { className: "warning", textContent: note });
-      for (const [words, colour] of fact.keys) {
+      const notes = new Set(fact.runs.map((run) => run.note).filter(Boolean));
+      for (const note of notes) element("span", caption, { className: "warning", textContent: note });
+      const names = fact.runs.length > 1 ? fact.runs.map((run) => [run.name, run.colour]) : [];
+      for (const [words, colour] of [...(fact.spacing ? [[fact.spacing]] : []), ...names]) {
         const key = element("span", caption, { className: "key" });
         if (colour) element("i", key).style.background = colour;
         key.append(words);
@@ -214,6 +216,7 @@ window.views = window.views || {};
       const merged = (name) => run[name] && run[name].forEach((one, k) => Object.assign(fact[name][k], one));
       if (run.times) fact.times = run.times;
       if (run.normal) fact.normal = run.normal;
+      if (run.marks) fact.marks = run.marks;
       ["bodies", "traces", "arrows", "curves"].forEach(merged);
       (run.traces || []).forEach((trace, k) => { if (trace.points) stage.setPoints(stage.runs[r].traces[k], trace.points); });
       this.measure();
@@ -290,14 +293,7 @@ window.views = window.views || {};
   views.ready = (async () => {
     const facts = JSON.parse(text("facts")), [unpack, THREE] = await Promise.all([arrays(), library()]);
     const root = document.getElementById("view");
-    let player = null;
-    try {
-      player = new Player(root, facts, facts.stages.map((stage) => unpacked(stage, unpack)), THREE);
-    } catch (error) {
-      root.replaceChildren();
-      views.element("p", root, { className: "warning", textContent: `This view needs WebGL, which the browser does not provide (${error.message}). Open the page in another browser, or switch on hardware acceleration.` });
-      throw error;
-    }
+    const player = new Player(root, facts, facts.stages.map((stage) => unpacked(stage, unpack)), THREE);
     if (facts.autoplay) player.autoplay();
     const handle = {
       seek: (time) => { player.touched = true; player.seek(time); },

@@ -11,7 +11,7 @@ import numpy as np
 from ..parameters import meant, short_names
 from ..text import Unit, in_unit, likely, readable_unit, shown
 from ..validation import require
-from .stage import Stage, css
+from .stage import Marks, Stage, css
 
 # Only for type checkers: matplotlib is optional, and plots stand below tables and fits, which use them.
 if TYPE_CHECKING:
@@ -308,7 +308,7 @@ PANEL = (7.0, 2.0)
 
 
 def draw_series(
-    tables: Sequence["Table"], names: Sequence[str], labels: Sequence[str], ax: "Axes | None" = None
+    tables: list["Table"], names: Sequence[str], labels: Sequence[str], marks: list[Marks], ax: "Axes | None" = None
 ) -> "Figure | Axes":
     """Draw quantities over time, with a panel for each quantity and a colour for each run.
 
@@ -317,6 +317,7 @@ def draw_series(
     - `tables`: for each run, a `Table` over "time".
     - `names`: names of variables, or of components, such as "position.x"; all components of a vector are drawn.
     - `labels`: names of the runs, for the legend; an empty label leaves a run out.
+    - `marks`: for each run, the times that a dotted line marks, in the unit of the tables, and what they are.
     - `ax`: matplotlib axes to draw a single quantity in, instead of a new figure.
 
     **Returns:** a matplotlib figure, or `ax`.
@@ -330,8 +331,9 @@ def draw_series(
         panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     else:
         figure, panels = None, [ax]
+    explained: list[str] = []
     for panel, name in zip(panels, names, strict=True):
-        for table, label in zip(tables, labels, strict=True):
+        for table, label, marked in zip(tables, labels, marks, strict=True):
             colour, dims = None, table.inner.get(name, ())
             if len(dims) == 1 and table[dims[0]].dtype.kind == "U":
                 # All components of a vector.
@@ -345,11 +347,14 @@ def draw_series(
                 # A line without a text stays out of the legend.
                 (line,) = panel.plot(table["time"], values, style, linewidth=1.2, color=colour, label=text or None)
                 colour = line.get_color()
+            for time, words in marked:
+                panel.axvline(time, color=colour, linestyle=":", linewidth=1.2, label=words)
             panel.set_ylabel(quantity)
         panel.margins(x=0.0)
-        if texts := panel.get_legend_handles_labels()[1]:
-            # Above the panel, where it covers no curve.
-            panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=_columns(texts), fontsize="small")
+        # Not again below a panel that has the same.
+        if (texts := panel.get_legend_handles_labels()[1]) != explained:
+            _legend_above(panel)
+            explained = texts
     panels[-1].set_xlabel(tables[0].label("time"))
     return figure or panels[0]
 
@@ -364,11 +369,16 @@ def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> "Figure":
     shows = [show for stage in stages for show in stage.shows]
     labels = list(dict.fromkeys(curve.label for show in shows for curve in show.curves))
     figure = new_figure(7.0, 1.3 + 1.5 * len(labels))
-    for label, panel in zip(labels, figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0], strict=True):
-        for show in shows:
+    panels = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
+    names = names or [show.name if len(shows) > 1 else "" for show in shows]
+    for label, panel in zip(labels, panels, strict=True):
+        for show, name in zip(shows, names, strict=True):
+            style = {"color": css(show.colour), "linewidth": 1.0}
             for curve in show.curves:
                 if curve.label == label:
-                    panel.plot(show.times, curve.factor * curve.values, color=css(show.colour), linewidth=1.0)
+                    panel.plot(show.times, curve.factor * curve.values, label=name or None, **style)
+            for time, words in show.marks:
+                panel.axvline(time, linestyle=":", label=words, **style)
         panel.margins(x=0.0)
         low, high = panel.get_ylim()
         middle = (low + high) / 2.0
@@ -378,15 +388,15 @@ def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> "Figure":
             panel.set_ylim(middle - min_range, middle + min_range)
         panel.set_ylabel(label, fontsize="small")
     panel.set_xlabel("time [s]")
-    if len(shows) > 1 or any(names):
-        names = names or [show.name for show in shows]
-        figure.legend(names, loc="outside upper center", ncols=_columns(names), fontsize="small")
+    _legend_above(panels[0])
     return figure
 
 
-def _columns(names: Sequence[str]) -> int:
-    """As many columns of a legend as the longest name leaves room for."""
-    return min(len(names), max(1, WIDTH // (max(map(len, names)) + 6)))
+def _legend_above(panel: "Axes") -> None:
+    """Draw the legend of a panel, if it has one, above it, where it covers no curve."""
+    if texts := panel.get_legend_handles_labels()[1]:
+        columns = min(len(texts), max(1, WIDTH // (max(map(len, texts)) + 6)))
+        panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize="small")
 
 
 # The picture of a fit: data and model, residuals, distributions and correlations.

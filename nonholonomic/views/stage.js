@@ -7,6 +7,8 @@ window.views = window.views || {};
   const CREASE = cos(0.8);
   //: Least height of the camera above the tangent plane, divided by its distance, so that it cannot look from below.
   const LOWEST = 0.06;
+  //: Colours behind the arena and of the lines on it.
+  const BACKGROUND = "#fbfbfa", LINES = "#7c8896";
   const element = (kind, parent, properties = {}) => parent.appendChild(Object.assign(document.createElement(kind), properties));
 
   // The meshes of one body as corners with normals, averaged over the triangles around a corner except at sharp edges.
@@ -47,15 +49,15 @@ window.views = window.views || {};
   class Stage {
     // `fact`: the data of a stage from Python, with unpacked arrays; `box`: the element that the stage fills.
     constructor(THREE, box, fact) {
-      Object.assign(this, { THREE, box, fact, size: fact.size, focus: null, span: 1 });
-      this.renderer = new THREE.WebGLRenderer({ antialias: true });
+      Object.assign(this, { THREE, box, fact, size: max(...fact.runs.map((run) => run.size)), focus: null, span: 1 });
+      this.renderer = this.drawer();
       this.renderer.setPixelRatio(min(window.devicePixelRatio || 1, 2));
       this.renderer.shadowMap.enabled = true;
       this.renderer.shadowMap.type = THREE.PCFSoftShadowMap;
       box.appendChild(this.renderer.domElement);
       this.labels = element("div", box, { className: "labels" });
       this.scene = new THREE.Scene();
-      this.scene.background = new THREE.Color(fact.background);
+      this.scene.background = new THREE.Color(BACKGROUND);
       this.camera = new THREE.PerspectiveCamera(fact.angle, 1, 0.01 * this.size, 1e4 * this.size);
       this.camera.up.set(0, 0, 1);
       this.controls = new THREE.OrbitControls(this.camera, this.renderer.domElement);
@@ -68,6 +70,17 @@ window.views = window.views || {};
       new ResizeObserver(() => { if (this.fit()) this.render(); }).observe(box);
     }
 
+    // Without WebGL, a text stands in place of the picture; curves and sliders work.
+    drawer() {
+      try {
+        return new this.THREE.WebGLRenderer({ antialias: true });
+      } catch (error) {
+        this.box.classList.add("flat");
+        const words = `This picture needs WebGL, which the browser does not provide (${error.message}). Open the page in another browser, or switch on hardware acceleration.`;
+        const domElement = element("p", this.box, { className: "warning", textContent: words });
+        return { domElement, shadowMap: {}, setPixelRatio() {}, setSize() {}, render() {} };
+      }
+    }
     light() {
       const { THREE, scene, size } = this;
       scene.add(new THREE.HemisphereLight(0xffffff, 0xc9cdd3, 0.6));
@@ -103,7 +116,7 @@ window.views = window.views || {};
       const pairs = [];
       for (const line of [...lines, ...this.axes(axes, vertices)]) for (let k = 0; k + 5 < line.length; k += 3) pairs.push(...line.subarray(k, k + 6));
       const grid = this.geometry({ positions: new Float32Array(pairs) });
-      this.scene.add(new THREE.LineSegments(grid, new THREE.LineBasicMaterial({ color: this.fact.lines, transparent: true, opacity: 0.55 })));
+      this.scene.add(new THREE.LineSegments(grid, new THREE.LineBasicMaterial({ color: LINES, transparent: true, opacity: 0.55 })));
     }
 
     // Lines at round values over a level rectangle, with labels along two of its sides, between which the names stand.
@@ -112,7 +125,9 @@ window.views = window.views || {};
       const gap = 0.05 * max(high[0] - low[0], high[1] - low[1]);
       this.marks = [];
       axes.forEach(([name, centre, scale], k) => {
-        const [begin, end] = [low[k], high[k]].map((place) => centre + place / scale), least = max((end - begin) / 50, min((end - begin) / 7, (0.6 * this.size) / scale));
+        const [begin, end] = [low[k], high[k]].map((place) => centre + place / scale), span = end - begin;
+        // The labels of a narrow side need room, too.
+        const least = max(span / 50, min(span / 7, (0.6 * this.size) / scale), (1.6 * gap) / scale);
         const power = 10 ** Math.floor(Math.log10(least)), step = power * [1, 2, 5, 10].find((factor) => factor * power >= 0.999 * least);
         const point = (along, across) => (k ? [across, along, low[2]] : [along, across, low[2]]);
         const mark = (textContent, along, away) => this.marks.push({

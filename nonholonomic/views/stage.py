@@ -17,6 +17,9 @@ from ..text import Unit, in_unit, require_unit_of
 
 Points = Float[np.ndarray, "times 3"]
 
+#: Times [s] that curves mark, and what they are, such as (1.2, "turned over at 1.2 s").
+Marks = tuple[tuple[float, str], ...]
+
 #: The parts of a drawing, and a function of your own system, the time and the state that returns them, or `None` for a default.
 Parts = Sequence["AbstractPart | Line"]
 Drawing = Callable[..., Parts]
@@ -87,7 +90,8 @@ class Curve(NamedTuple):
 class Show(NamedTuple):
     """The drawing of one run: `size` is a length [m] of the body, and `colour` the colour of its curves.
 
-    `normal` is the arena's unit normal at the body, towards the body; `note` states what the model omits.
+    `normal` is the arena's unit normal at the body, towards the body; `note` states what the model omits; `marks` are marked
+    in the curves.
     """
 
     name: str
@@ -100,6 +104,7 @@ class Show(NamedTuple):
     arrows: tuple[Arrow, ...]
     curves: tuple[Curve, ...]
     note: str = ""
+    marks: Marks = ()
 
 
 class Arena(NamedTuple):

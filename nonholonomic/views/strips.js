@@ -23,7 +23,8 @@ window.views = window.views || {};
     return Number.isFinite(v) ? v : part < 0.5 ? before : after;
   }
 
-  const LEFT = 58, FOOT = 4;
+  //: Room left of a curve for its numbers, and below it; the sizes of the texts in pixels.
+  const LEFT = 66, FOOT = 5, TEXT = 13;
 
   class Strips {
     // `runs()`: returns the runs, with `times`, `colour` and `curves`; `seek(time)`: called when the reader clicks at a time.
@@ -33,9 +34,18 @@ window.views = window.views || {};
         const legend = views.element("div", parent, { className: "names" });
         for (const run of runs()) views.element("span", legend, { textContent: run.legend ?? run.name }).style.color = run.colour;
       }
-      const labels = [...new Set(runs().flatMap((run) => run.curves.map((curve) => curve.label)))];
-      this.strips = labels.map((label) => {
-        const box = views.element("div", parent, { className: "strip" }), head = views.element("div", box, { className: "head" });
+      const curves = runs().flatMap((run) => run.curves), labels = [...new Set(curves.map((curve) => curve.label))];
+      // The curves that check a run are folded away below the others.
+      const folded = (label) => labels.length > 2 && /^(energy|Jellett)/.test(label);
+      let fold = null;
+      const more = () => {
+        const details = views.element("details", parent, { className: "more" });
+        views.element("summary", details, { textContent: "More curves" });
+        return views.element("div", details, { className: "strips" });
+      };
+      this.strips = labels.sort((a, b) => folded(a) - folded(b)).map((label) => {
+        if (folded(label)) fold = fold || more();
+        const box = views.element("div", fold || parent, { className: "strip" }), head = views.element("div", box, { className: "head" });
         views.element("span", head, { textContent: label });
         const value = views.element("span", head, { className: "value" }), canvas = views.element("canvas", box);
         const strip = { label, canvas, value };
@@ -60,7 +70,7 @@ window.views = window.views || {};
       for (const strip of this.strips) {
         strip.curves = runs.flatMap((run) => run.curves.filter((curve) => curve.label === strip.label)
           .map((curve) => ({
-            times: run.times, colour: run.colour, values: curve.factor === 1 ? curve.values : curve.values.map((v) => curve.factor * v),
+            times: run.times, colour: run.colour, marks: run.marks, values: curve.factor === 1 ? curve.values : curve.values.map((v) => curve.factor * v),
           })));
         let low = Infinity, high = -Infinity;
         for (const curve of strip.curves) for (const v of curve.values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
@@ -105,16 +115,24 @@ window.views = window.views || {};
       if (!strip.ahead) this.paint(strip);
       const { canvas, x0, x1, y0, y1, ratio } = strip, pen = canvas.getContext("2d"), now = strip.x(time);
       pen.clearRect(0, 0, canvas.width, canvas.height);
-      Object.assign(pen, { fillStyle: "#6b7280", font: `${11 * ratio}px system-ui, sans-serif`, textAlign: "right" });
-      pen.fillText(digits(strip.high), x0 - 6 * ratio, y1 + 6 * ratio);
-      pen.fillText(digits(strip.low), x0 - 6 * ratio, y0);
+      Object.assign(pen, { fillStyle: "#23262b", font: `${TEXT * ratio}px system-ui, sans-serif`, textAlign: "right" });
+      pen.fillText(digits(strip.high, 3), x0 - 6 * ratio, y1 + 8 * ratio);
+      pen.fillText(digits(strip.low, 3), x0 - 6 * ratio, y0);
       Object.assign(pen, { strokeStyle: "#dde1e6", lineWidth: ratio });
       pen.strokeRect(x0, y1, x1 - x0, y0 - y1);
       pen.drawImage(strip.ahead, 0, 0);
       pen.save(); pen.beginPath(); pen.rect(0, 0, now, canvas.height); pen.clip(); pen.drawImage(strip.passed, 0, 0); pen.restore();
-      const upright = (at, dashes) => {
-        pen.strokeStyle = "#23262b"; pen.setLineDash(dashes); pen.beginPath(); pen.moveTo(at, y0); pen.lineTo(at, y1); pen.stroke(); pen.setLineDash([]);
+      const upright = (at, dashes, colour = "#23262b") => {
+        pen.strokeStyle = colour; pen.setLineDash(dashes); pen.beginPath(); pen.moveTo(at, y0); pen.lineTo(at, y1); pen.stroke(); pen.setLineDash([]);
       };
+      strip.curves.forEach(({ times, values, colour, marks }, k) => marks.forEach(([at, words]) => {
+        upright(strip.x(at), [2 * ratio, 2 * ratio], colour);
+        pen.fillStyle = colour; pen.beginPath(); pen.arc(strip.x(at), strip.y(valueAt(values, place(times, at))), 4 * ratio, 0, 7); pen.fill();
+        if (strip !== this.strips[0]) return;
+        const left = strip.x(at) < 0.6 * x1;
+        pen.textAlign = left ? "left" : "right";
+        pen.fillText(words, strip.x(at) + (left ? 6 : -6) * ratio, y0 - (6 + 1.2 * TEXT * k) * ratio);
+      }));
       upright(now, []);
       if (this.pointed !== null) upright(strip.x(this.pointed), [3 * ratio, 3 * ratio]);
       const shown = this.pointed ?? time;

@@ -140,7 +140,7 @@ class Plan(eqx.Module):
         is_cross, target = problem.goal.heading is None, goal_corners(problem)
         draw(target.mean(axis=0)[None] if is_cross else target[CLOSED], "C2", 1.2, "goal", "x" if is_cross else "")
         above.grid(False)
-        above.locator_params(nbins=5)
+        above.locator_params(nbins=5 if axes == 3 else "auto")
         above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", **({"zticks": []} if axes == 3 else {}))
         above.set_title("reaches the goal" if self.reached else "; ".join(self.hindrances), fontsize="small")
         above.legend(fontsize="small")

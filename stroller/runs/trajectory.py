@@ -473,7 +473,7 @@ class Trajectory(AbstractRun):
         return table_of([self], [], self.model.description() | {"status": self.status}, names)
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
-        return names_of(runs, unit) if len(runs) > 1 else [""]
+        return names_of(runs, unit)
 
     def in_words(self) -> str:
         jackknives = self.jackknifed_at

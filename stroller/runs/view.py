@@ -222,6 +222,7 @@ def explore(
     input: Input | None = None,
     unit: Unit = None,
     jumps: Sequence[Any] | Array | None = None,
+    label: str | None = None,
 ) -> views.Page:
     """Make a page with sliders that simulates the ride in the browser while you move a slider.
 
@@ -241,6 +242,7 @@ def explore(
     - `t1`: horizon [s].
     - `unit`: unit of the curves, such as "deg" for all angles.
     - `jumps`: times [s] at which the input jumps, as for `simulate`.
+    - `label`: title of the page.
 
     **Returns:** a `Page`, with its `html`.
 
@@ -262,7 +264,7 @@ def explore(
     ```
     """
     model = checked_model(scene, launch, t1, input, TOLERANCE, jumps)
-    return explore_model(model, path, sliders, float(t1), unit)
+    return explore_model(model, path, sliders, float(t1), unit, label)
 
 
 @page_of.register(RideModel)
@@ -346,56 +348,3 @@ def frame(scene: Scene, controls: Input | None, time: Array, rows: Float[Array, 
         curves=tuple(values[name] for name in CURVES),
         turning_rate=fastest / (RADIUS * scene.body.wheelbase),
     )
-
-
-# The plot of the main job (needs matplotlib): paths on the ground, speed, energy and side forces.
-
-
-def draw_rides(rides: dict[tuple[str, str], Trajectory]) -> Any:
-    """Draw rides, one row of plots per ground.
-
-    **Arguments:** `rides`: (name of a ground, name of a ride) -> its trajectory.
-
-    **Returns:** a matplotlib figure.
-    """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
-
-    grounds = list(dict.fromkeys(ground for ground, _ in rides))
-    figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
-    layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
-    # As on the page, whose curves are those of all grounds, after that of a plan.
-    colours = {name: views.css(views.COLOURS[number % len(views.COLOURS)]) for number, name in enumerate(rides, 1)}
-    for row, ground in enumerate(grounds):
-        on_ground = {name: run for name, run in rides.items() if name[0] == ground}
-        space = figure.add_subplot(layout[row, 0], projection="3d")
-        # The lines of the ground do not depend on the side.
-        lines = np.array(ground_of(list(on_ground.values()), np.array([0.0, 0.0, 1.0])).lines)
-        for line in lines:
-            space.plot(*line.T, color="0.75", linewidth=0.4)
-        panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]
-        for name, run in on_ground.items():
-            colour = colours[name]
-            space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=name[1])
-            panels[0].plot(run.t, run.speed, color=colour)
-            panels[1].plot(run.t, run.energy, color=colour)
-            panels[1].plot(run.t, run.energy[0] + run.work, color="black", linewidth=0.8, linestyle=":")
-            panels[2].plot(run.t, run.side_force[:, 0], color=colour)
-            panels[2].plot(run.t, run.side_force[:, 1], color=colour, linestyle="--")
-        space.set(title=ground, xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-        space.xaxis.labelpad = space.yaxis.labelpad = 8
-        # As many ticks along each axis as there is room for; a plane has nearly no height to show.
-        spans = np.ptp(lines, axis=(0, 1))
-        for axis, span in zip((space.xaxis, space.yaxis, space.zaxis), spans, strict=True):
-            axis.set_major_locator(MaxNLocator(max(round(4.0 * span / max(spans)), 1)))
-        if spans[2] < 0.1 * max(spans):
-            space.set(zticks=[], zlabel="")
-        space.set_aspect("equal")
-        space.legend(fontsize="small")
-        for panel, label in zip(panels, ("speed [m/s]", "energy [J]", "side force [N]"), strict=True):
-            panel.set(xlabel="time [s]", ylabel=label)
-        # The legend beside the path explains the colours; this one explains the line styles, above, where it hides
-        # nothing.
-        panels[1].set_title("dotted: start plus work", fontsize="small")
-        panels[2].set_title("full: rear axle, dashed: front wheel", fontsize="small")
-    return figure

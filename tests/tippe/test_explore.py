@@ -344,6 +344,17 @@ def test_keys_play_and_reset(browser, page):
     slider = browser.find_element("css selector", "input[name=theta]")
     slider.send_keys(Keys.ARROW_RIGHT)
     assert browser.execute_script("return live.values()[0]") == pytest.approx(0.1 + 0.45 / 1000, abs=0.45 / 1000)
+    # The arrows move the run on the map by a cell, not the time.
+    reset(browser)
+    browser.execute_script("player.play(false); player.seek(0.5)")
+    browser.find_element("css selector", "#map canvas").send_keys(Keys.ARROW_RIGHT + Keys.ARROW_DOWN)
+    assert browser.execute_script("return live.values()") == pytest.approx([0.1 + 0.45 / 40, 155.0 - 140.0 / 30])
+    assert browser.execute_script("return player.time()") == 0.5
+    # The page marks when the top turned over.
+    wait(browser, "return live.outcome.value > 0")
+    marks = browser.execute_script("return player.stages[0].fact.runs[0].marks")
+    value = browser.execute_script("return live.outcome.value")
+    assert [[time, words] for time, words in marks] == [[value, f"turned over at {value:.3g} s"]]
 
 
 def test_labels_are_text(browser, page):

@@ -227,13 +227,37 @@ def test_labels_are_what_differs(run):
 
     assert texts() == ["mu 0.3 s/m", "mu 0.2 s/m"]
     assert texts(label=["rough", "smooth"]) == ["rough", "smooth"]
-    legend = run.plot(others=[other]).legends[0]
+    legend = run.plot(others=[other]).axes[0].get_legend()
     assert [text.get_text() for text in legend.get_texts()] == ["mu 0.3 s/m", "mu 0.2 s/m"]
     (panel,) = run.plot("theta", label="my top").axes
     assert panel.get_legend().get_texts()[0].get_text() == "my top"
     assert run.plot("theta").axes[0].get_legend() is None
+    assert run.plot("theta").get_suptitle() == run.plot().get_suptitle() == "rutstam top, θ(0) = 0.1 rad, 155 rad/s"
+    for options in ({}, {"overlaid": True}):
+        stages = run.stages([other], label=["rough", "smooth"], **options)
+        assert [show.name for stage in stages for show in stage.shows] == ["rough", "smooth"]
+    assert "<title>rough; smooth</title>" in run.view(others=[other], label=["rough", "smooth"]).html
+    assert "<title>my top</title>" in run.explore(label="my top").html
+    with pytest.raises(ValueError, match=re.escape("label = 'my top' must have 2 texts, one for each run")):
+        run.view(others=[other], label="my top")
     assert other.plot("energy", ax=panel) is panel
     assert len(panel.get_lines()) == 2
+
+
+def test_pictures_and_pages_mark_when_a_top_has_turned_over(run):
+    turned = tippe.simulate(run.scene, tippe.Launch(3.1, 155.0), 1.0, tolerance=1e-6)
+    words = "turned over at 0 s"
+    assert (turned.marks, run.marks) == (((0.0, words),), ())
+    assert turned.stages()[0].shows[0].marks == turned.marks
+    assert words in turned.view().html
+    assert words not in run.view().html
+    for figure in (turned.plot("theta", "spin"), turned.plot()):
+        first, second, *_ = figure.axes
+        assert [text.get_text() for text in first.get_legend().get_texts()] == [words]
+        assert second.get_legend() is None
+        for panel in (first, second):
+            assert panel.get_lines()[-1].get_linestyle() == ":"
+            assert panel.get_lines()[-1].get_xdata() == [0.0, 0.0]
 
 
 def test_plots_that_cannot_be_drawn_are_refused(run):

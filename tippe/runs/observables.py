@@ -22,12 +22,14 @@ from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import Unit, distinguishing_labels, in_unit
 from nonholonomic.validation import ArrayOrList, is_traced, require_one_run, times_within
+from nonholonomic.views import Marks
 
 from ..friction import Frictionless
 from ..model.body import AbstractBody, Top
 from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
 from ..modes.problems import INVERTED
+from ..presets import TOPS
 from ..steady import group
 
 # The quantities of a run of a tippe top, with units and names, and the table of a run.
@@ -76,11 +78,19 @@ def names_of(runs: list[Any], unit: Unit = None) -> list[str]:
     for run in runs:
         require_one_run(run, "a picture", ", and pass the others as others=")
     (angle, per_angle), (rate, per_rate) = (in_unit(si, unit) for si in ("rad", "rad/s"))
+    scenes = [run.scene for run in runs]
+    tops = [
+        next((f"{name} top" for name, top in TOPS.items() if eqx.tree_equal(top(), s.body)), "own top") for s in scenes
+    ]
     starts = [
         (f"θ(0) = {per_angle * float(run.theta[0]):.3g} {angle}", f"{per_rate * float(run.spin[0]):.4g} {rate}")
         for run in runs
     ]
-    return distinguishing_labels(starts, [run.scene for run in runs], unit=unit)
+    if tops.count("own top") < min(2, len(runs)):
+        # The names of presets say more than their numbers.
+        starts = [(top, *start) for top, start in zip(tops, starts, strict=True)]
+        scenes = [eqx.tree_at(lambda scene: scene.body, scene, scenes[0].body) for scene in scenes]
+    return distinguishing_labels(starts, scenes, unit=unit)
 
 
 # The run of a top: one state at each time.
@@ -298,7 +308,14 @@ class AbstractTrajectory(AbstractRun):
         return run_table(quantities, coords, values, ["time"], request)
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
-        return names_of(runs, unit) if len(runs) > 1 else [""]
+        return names_of(runs, unit)
+
+    @property
+    def marks(self) -> Marks:
+        if self.dense is None or not isinstance(self.scene.body, AbstractBody):
+            return ()
+        time = self.inversion_time
+        return ((time, f"turned over at {time:.3g} s"),) if np.isfinite(time) else ()
 
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:

@@ -228,6 +228,7 @@ def explore(
     sliders: Sliders | None = None,
     t1: float = 8.0,
     unit: Unit = None,
+    label: str | None = None,
 ) -> views.Page:
     """Make a page with sliders that simulates the top in the browser while you move a slider. The page is one file that
     needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta pair, the step-size
@@ -245,6 +246,7 @@ def explore(
       friction and, for a top without a stem, the offset; under `NoSlip` theta and spin in both senses.
     - `t1`: horizon [s].
     - `unit`: unit of the curves, such as "deg" for all angles.
+    - `label`: title of the page.
 
     **Returns:** a `Page`, with its `html`.
 
@@ -265,9 +267,8 @@ def explore(
     ```
     """
     check_run(scene, launch, t1, TOLERANCE)
-    return explore_model(
-        TopModel(scene=scene, launch=launch), path, sliders, float(t1), unit or getattr(launch, "shown_in", None)
-    )
+    model, unit = TopModel(scene=scene, launch=launch), unit or getattr(launch, "shown_in", None)
+    return explore_model(model, path, sliders, float(t1), unit, label)
 
 
 @page_of.register(TopModel)

@@ -213,9 +213,9 @@ def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
     canvas = browser.find_element("css selector", ".strip canvas")
     browser.execute_script("arguments[0].scrollIntoView({ block: 'center' })", canvas)
     ActionChains(browser).move_to_element(canvas).click().perform()
-    # The middle of the canvas, whose axis begins at 58 and ends 4 pixels before its edge.
+    # The middle of the canvas, whose axis begins at 66 and ends 4 pixels before its edge.
     width = canvas.size["width"]
-    assert browser.execute_script("return player.time()") == pytest.approx((width / 2 - 58) / (width - 62), abs=0.01)
+    assert browser.execute_script("return player.time()") == pytest.approx((width / 2 - 66) / (width - 70), abs=0.01)
 
 
 def test_round_off_at_the_end_of_a_curve_is_labelled_as_zero(browser):
@@ -334,13 +334,71 @@ def test_curves_and_their_numbers_can_be_read():
     assert len({css(colour) for colour in COLOURS}) == 6
 
 
-def test_a_browser_without_webgl_says_so(browser, stages, tmp_path):
-    with opened(browser, page(stages, "No picture"), tmp_path / "flat.html"):
-        script = {"source": "HTMLCanvasElement.prototype.getContext = () => null"}
-        browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", script)
+#: A browser without WebGL.
+FLAT = """
+const get = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+  return /webgl/.test(kind) ? null : get.call(this, kind, ...rest);
+};
+"""
+
+
+def test_a_browser_without_webgl_says_so_and_shows_the_curves(browser, stages, tmp_path):
+    with opened(browser, page(stages, "No picture", autoplay=False), tmp_path / "flat.html"):
+        script = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": FLAT})
         browser.get((tmp_path / "flat.html").as_uri())
-        wait(browser, "return document.getElementById('view').textContent.includes('This view needs WebGL')")
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
+        wait(browser, "return !!window.player")
+        assert browser.execute_script(
+            "player.seek(0.25); return [...document.querySelectorAll('.scene')]"
+            ".every((one) => one.textContent.includes('needs WebGL'))"
+        )
+        values = browser.execute_script(
+            "return [...document.querySelectorAll('.strip .value')].map((one) => one.textContent)"
+        )
+        assert len(values) == 7
+        assert all(values)
         browser.get_log("browser")
+
+
+def test_the_first_curve_is_large_and_checks_are_folded_away(browser):
+    strips = browser.execute_script(
+        "return [...document.querySelectorAll('.strip')].map((one) => [one.querySelector('.head span').textContent,"
+        "parseFloat(getComputedStyle(one).fontSize), one.checkVisibility()])"
+    )
+    assert strips[0] == ["θ, normal to axis [deg]", 18, True]
+    assert {size for _, size, _ in strips[1:]} == {14}
+    hidden = sorted(label.partition(" [")[0] for label, _, is_shown in strips if not is_shown)
+    assert hidden == ["Jellett's quantity", "energy"]
+    browser.execute_script("document.querySelector('summary').click()")
+    wait(browser, "return [...document.querySelectorAll('.strip')].every((one) => one.checkVisibility())")
+    browser.execute_script("document.querySelector('summary').click()")
+
+
+def test_marks_of_a_run_are_drawn_in_its_curves(browser, top):
+    """In its colour, in the column of their time."""
+    browser.execute_script("player.seek(0); player.setRun(0, 0, { marks: [[0.25, 'turned over at 0.25 s']] })")
+    count = """
+const pen = document.querySelector('.strip canvas').getContext('2d'), { width, height } = pen.canvas;
+const ratio = devicePixelRatio || 1, left = 66 * ratio, x = Math.round(left + 0.25 * (width - 4 * ratio - left));
+const data = pen.getImageData(x - 1, 0, 3, height).data;
+let red = 0;
+for (let k = 0; k < data.length; k += 4) red += data[k] > 150 && data[k + 1] < 150 && data[k + 3] > 100;
+return red;
+"""
+    marked = browser.execute_script(count)
+    browser.execute_script("player.setRun(0, 0, { marks: [] })")
+    assert marked > browser.execute_script(count) + 20
+
+
+def test_in_the_dark_the_page_is_dark_and_its_texts_are_read(browser):
+    features = [{"name": "prefers-color-scheme", "value": "dark"}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    filters = browser.execute_script(
+        "return ['html', '.scene', '.strip'].map((one) => getComputedStyle(document.querySelector(one)).filter)"
+    )
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    assert filters == ["invert(0.9) hue-rotate(180deg)", "invert(1) hue-rotate(180deg)", "none"]
 
 
 def test_a_page_asks_for_nothing_from_elsewhere(browser, stages, tmp_path):
