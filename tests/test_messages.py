@@ -20,6 +20,32 @@ from nonholonomic.views import Page
 
 pytestmark = pytest.mark.oldest
 
+
+class Skate(nonholonomic.AbstractSystem):
+    """Its constraint is a list instead of a row."""
+
+    dimension = 3
+
+    def metric(self, q):
+        return jnp.eye(3)
+
+    def constraints(self, q):
+        return jnp.array([jnp.sin(q[2]), -jnp.cos(q[2]), 0.0])
+
+
+class Leaving(nonholonomic.AbstractMode):
+    """Its reset leads to a mode that does not exist."""
+
+    def field(self, t, y):
+        return -jnp.ones(1)
+
+    def margin(self, t, y):
+        return y[0]
+
+    def reset(self, t, y):
+        return y + 1.0, 5
+
+
 REFUSED = {
     "the other package's scene": (
         lambda: tippe.simulate(PRAM, LAUNCH, 1.0),
@@ -155,6 +181,42 @@ REFUSED = {
     "a stroller larger than its torus": (
         lambda: stroller.Scene(PRAM.body, stroller.Torus(0.15, 0.1)),
         "surface ring + tube = 0.25 must be at least 0.35",
+    ),
+    "a heading in a goal's place": (
+        lambda: stroller.plan(PRAM, RIDE, stroller.Goal((1, 2, 3.0), 0.0), 10.0),
+        "goal: place = (1.0, 2.0, 3.0): distance from the surface = 3.0 must be at most",
+    ),
+    "the fix of a heading in a goal's place": (
+        lambda: stroller.plan(PRAM, RIDE, stroller.Goal((1, 2, 3.0), 0.0), 10.0),
+        "(x, y, z), z the height, of a point on the surface up to round-off); a heading is an argument of its own, heading=",
+    ),
+    "a column for a place": (
+        lambda: stroller.Launch(np.zeros((2, 1)), 0.0, 1.0),
+        "place is an array of shape (2, 1) and must be a pair of numbers: flatten it",
+    ),
+    "three speeds for a limit": (
+        lambda: stroller.Limits(speed=(1, 2, 3)),
+        "speed = (1.0, 2.0, 3.0) must be one positive number, such as 1 for (-1, 1), or a pair (lowest, highest)",
+    ),
+    "an input that returns the force alone": (
+        lambda: stroller.simulate(PRAM, RIDE, 1.0, lambda t, motion: motion.speed),
+        "must return one drive force [N] and one steering torque [N m], as a pair, not a number of type float64",
+    ),
+    "times beyond the end": (
+        lambda: stroller.simulate(PRAM, RIDE, 10.0, times=(0, 20)),
+        "times = 20.0 must be at most 10.0 (the run is from 0 to t1)",
+    ),
+    "one constraint that is no row": (
+        lambda: nonholonomic.simulate(Skate(), ([0.0] * 3, [0.0] * 3), 1.0),
+        "of shape (k, 3), a row for each constraint, such as jnp.array([[...]]) for one, not (3,)",
+    ),
+    "a reset to no mode": (
+        lambda: nonholonomic.simulate(nonholonomic.Hybrid([Leaving()]), [1.0], 1.0),
+        "modes[0].reset(t, y) returned mode 5; there is 1 mode (0)",
+    ),
+    "a reset to none of three modes": (
+        lambda: nonholonomic.simulate(nonholonomic.Hybrid([Leaving()] * 3), [1.0], 1.0),
+        "modes[0].reset(t, y) returned mode 5; there are 3 modes (0 to 2)",
     ),
     "a table called CSV": (
         lambda: small_table().save("x.csv"),
@@ -466,6 +528,13 @@ def test_an_unknown_quantity_of_a_run_is_answered_by_a_likely_one():
     assert not hasattr(run_of_nothing(), "_repr_png_")
     with pytest.raises(AttributeError, match=r"did you mean 'theta'\?"):
         _ = run_of_nothing().tetha
+
+
+def test_an_unknown_quantity_of_an_inputs_motion_is_answered_by_a_likely_one():
+    for wrong, likely in {"v": "speed", "stering": "steering"}.items():
+        known = "It has position, heading, steering, speed, front_speed, yaw_rate, steering_rate"
+        with pytest.raises(AttributeError, match=f"the motion has no '{wrong}'; did you mean '{likely}'\\? {known}"):
+            stroller.simulate(PRAM, RIDE, 1.0, lambda t, motion, wrong=wrong: (getattr(motion, wrong), 0.0))
 
 
 def test_an_error_within_a_quantity_of_a_run_is_not_hidden():

@@ -198,8 +198,8 @@ COMPARISONS = ["gt", "ge", "lt", "le", "eq", "ne", "lt_to", "le_to"]
 KINKS = ["max", "min", "abs", "sign", "clamp"]
 STAIRS = ["floor", "ceil", "round"]
 
-#: Functions of JAX that are smooth, whatever their operations.
-SMOOTH = ["sinc"]
+#: Traced functions that are smooth, whatever their operations: one of JAX, and the splines of plans.
+SMOOTH = ["sinc", "evaluate_spline"]
 
 
 def jumps_of(function: Function, t: PyTree, *others: PyTree) -> tuple[Float[Array, " jumps"], tuple[str, ...]]:

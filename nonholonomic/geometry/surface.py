@@ -203,10 +203,9 @@ class AbstractSurface(Bounded):
         if len(place) == 3:
             distance = self.offset(self.in_own_axes(place))
             tolerance = ROUND_OFF * (size + jnp.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
-            reason = "of the place from the surface, in metres: the place must be on the surface up to round-off"
-            yield Bound(
-                0.0 if distance is None else distance, "distance", at_least=-tolerance, at_most=tolerance, why=reason
-            )
+            reason = "in metres: three numbers are (x, y, z), z the height, of a point on the surface up to round-off"
+            name, distance = f"place = {shown(place)}: distance from the surface", 0.0 if distance is None else distance
+            yield Bound(distance, name, at_least=-tolerance, at_most=tolerance, why=reason)
 
     def sign(self, side: str | None, closed: str) -> float:
         """1.0 if n points to the side where the body is, else -1.0.

@@ -630,7 +630,7 @@ def require_times(times: ArrayLike | Sequence[float] | None, t1: object) -> None
         raise ValueError(
             f"times = {shown(times)} must be a list of at least one number; np.linspace makes evenly spaced ones"
         )
-    require_all([Bound(times, "times", at_least=0.0, at_most=t1)])
+    require_all([Bound(times, "times", at_least=0.0, at_most=t1, why="the run is from 0 to t1")])
     require_increasing(times, "times")
 
 

@@ -400,7 +400,7 @@ def stage_of(numbers: Sequence[int], runs: list["Trajectory"]) -> tuple[Drawing,
 
 #: Why a run ended early, by its word.
 REASONS = {
-    "failed": "a function may return NaN or infinity there, or reset the index of no mode",
+    "failed": "a function may return NaN or infinity there, or `reset` the index of a mode that the Hybrid does not have",
     "unresolved": "resets followed one another without end; add a mode for rest, or start where the margin is positive; or "
     f"the run is too long: it may have at most {MOST_ROUNDS} resets",
 }

@@ -502,7 +502,8 @@ class ChunkStore:
     def interrupted(self) -> str:
         """Message after Ctrl-C: what is saved, and how to resume."""
         saved, total = (with_spaces(n) for n in (sum(map(self.layout.size, self.finished)), self.layout.cells))
-        return f"saved {saved} of {total} cells to {self.path}; run the same call again to resume"
+        reading = f", or read them from {self.folder} with Table.load({str(self.path)!r})" if self.finished else ""
+        return f"saved {saved} of {total} cells to {self.path}; run the same call again to resume{reading}"
 
     def _locked(self) -> IO[bytes] | None:
         """Create the folder, and keep others from computing the same file; the system releases the lock when this process

@@ -20,7 +20,7 @@ from ..compilation.tracing import dependent_outputs, is_elementary, jumps_of, na
 from ..compilation.xla_cpu import Function, equations_in, traced
 from ..parameters import TreeForm
 from ..text import described, shown
-from ..validation import as_number, require, warn
+from ..validation import as_number, is_traced, require, warn
 from .mechanics import AbstractFormulation, AbstractMode, AbstractSystem, Lagrange, State, components_of, exit_of
 
 # A hybrid system: smooth modes with resets between them, as functions of one state.
@@ -284,6 +284,11 @@ def _check_mode(form: Form, mode: int) -> tuple[int, bool]:
         raise ValueError(f"{expected}; its state is {described(state)}, not an array of shape ({form.size},)")
     if getattr(number, "shape", None) != () or not jnp.issubdtype(number.dtype, jnp.integer):
         raise ValueError(f"{expected}; its number is {described(number)}, not a whole number")
+    following: list[Any] = []
+    jax.eval_shape(lambda *arguments: following.append(form.function("reset", mode)(*arguments)[1]), *form.arguments)
+    if not is_traced(following) and not 0 <= following[0] < form.modes:
+        known = "there is 1 mode (0)" if form.modes == 1 else f"there are {form.modes} modes (0 to {form.modes - 1})"
+        raise ValueError(f"{_name('reset', mode)} returned mode {following[0]}; {known}")
     return count, True
 
 
@@ -349,7 +354,7 @@ def _check_functions(form: Form, prefix: str) -> None:
         "potential(q)": ((q,), "one number", lambda shape: shape == ()),
         "constraints(q)": (
             (q,),
-            f"of shape (k, {n}), a row for each constraint",
+            f"of shape (k, {n}), a row for each constraint, such as jnp.array([[...]]) for one",
             lambda shape: shape is not None and len(shape) == 2 and shape[1] == n,
         ),
         "frame(q)": ((q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),

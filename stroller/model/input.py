@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from nonholonomic.compilation.components import Held, TooLarge, by_components, over_last_axis, spelled_out
 from nonholonomic.compilation.tracing import TracedFunction, in_cells, is_elementary, jumps_of, warn_of_unclear
 from nonholonomic.geometry import Vector
-from nonholonomic.text import is_users, name_of, shown
+from nonholonomic.text import described, is_users, likely, name_of, shown
 from nonholonomic.validation import Bounded, as_number, is_traced
 
 
@@ -55,6 +55,12 @@ class Motion(NamedTuple):
     front_speed: Float[Array, "..."]
     yaw_rate: Float[Array, "..."]
     steering_rate: Float[Array, "..."]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        hint = "; did you mean 'speed'?" if name in ("v", "velocity") else likely(name, self._fields) or "."
+        raise AttributeError(f"the motion has no {name!r}{hint} It has {', '.join(self._fields)}")
 
 
 Input: TypeAlias = Callable[[Float[Array, "..."], Motion], tuple[Float[Array, "..."], Float[Array, "..."]]]
@@ -122,14 +128,16 @@ def check_input(controls: Any, scene: Any, launch: Any, jumps: Any = None) -> No
     except TypeError as error:
         raise ValueError(f"{name} must be {WANTED}: {error}") from None
     try:
-        shapes = [np.shape(part) for part in jax.eval_shape(controls, t, motion)]
+        result = jax.eval_shape(controls, t, motion)
+        shapes = [np.shape(part) for part in result] if isinstance(result, tuple | list) else None
     except (TypeError, IndexError) as error:
         problem = "must return (drive force [N], steering torque [N m])"
         if isinstance(error, jax.errors.JAXTypeError):
             problem = "cannot be traced by JAX: write it with jax.numpy, and jnp.where in place of `if`"
         raise ValueError(f"{name} {problem} ({str(error).strip().splitlines()[0]})") from error
     if shapes != [(), ()]:
-        raise ValueError(f"{name} must return one drive force [N] and one steering torque [N m], not shapes {shapes}")
+        got = described(result) if shapes is None else f"shapes {shapes}"
+        raise ValueError(f"{name} must return one drive force [N] and one steering torque [N m], as a pair, not {got}")
     values = jax.tree.leaves(controls(t, motion))
     if not any(is_traced(part) for part in values) and not np.all(np.isfinite([float(part) for part in values])):
         numbers = ", ".join(f"{float(part):g}" for part in values)

@@ -50,6 +50,8 @@ USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
 def as_place(value: Any, name: str = "place", counts: tuple = (2, 3), single: bool = False) -> tuple[Converted, ...]:
     """Two or three numbers, or `single` ones, as a tuple of arrays; raises `ValueError` for anything else."""
     numbers = as_numbers(value)
+    if is_array(value) and np.shape(value)[1:] == (1,):
+        raise ValueError(f"{name} is an array of shape {np.shape(value)} and must be a pair of numbers: flatten it")
     if not isinstance(numbers, tuple) or len(numbers) not in counts or (single and any(map(np.ndim, numbers))):
         raise ValueError(f"{name} = {shown(numbers)} must be a pair of numbers{', or (x, y, z) [m]' * (3 in counts)}")
     return numbers
@@ -155,8 +157,8 @@ class Scene(Bounded):
     - `heading`: "intrinsic", or "projected" to reproduce the paper on a plane, sphere or spheroid, which constrains the
       horizontal projection of the velocities (`stroller.md`, section 3, explains why this is not the default).
 
-    **Raises:** `ValueError` if a part is of the wrong kind, a word is unknown, a number is out of range, or the surface is
-    smaller than the wheelbase.
+    **Raises:** `ValueError` if a part is of the wrong kind, a word is unknown, a number is out of range, or the diameter of a
+    sphere, spheroid or torus is smaller than the wheelbase. Along a cylinder's axis, there is room for both axles.
 
     **Example:**
 

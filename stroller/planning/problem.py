@@ -398,7 +398,7 @@ class Limits(Angled):
         pairs = {name: getattr(self, name) for name in self.units if getattr(self, name) is not None}
         for name, value in pairs.items():
             if not (isinstance(value, tuple) and len(value) == 2):
-                bound = f"{largest(as_number(value)) or 1.0:g}"
+                bound = f"{(largest(as_number(value)) if np.ndim(value) == 0 else 0.0) or 1.0:g}"
                 words = f"one positive number, such as {bound} for (-{bound}, {bound}), or a pair (lowest, highest)"
                 raise ValueError(f"{name} = {shown(value)} must be {words}")
         yield from super().bounds()
@@ -702,7 +702,8 @@ def checked_problem(
         try:
             require_all(scene.surface.place_bounds(place, scene.body.wheelbase))
         except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
+            remark = "; a heading is an argument of its own, heading=" if name == "goal" and len(place) == 3 else ""
+            raise ValueError(f"{name}: {error}{remark}") from None
     if not np.all(np.isfinite(problem.goal_pose)):
         raise ValueError(f"goal: place = {goal.place} must be on the ground, where it has no finite position")
     if problem.distance > FARTHEST * float(scene.body.wheelbase):

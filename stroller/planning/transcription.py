@@ -109,9 +109,10 @@ def weighted(weights: list[Numbers | float], coefficients: Numbers | list[Number
     return a * coefficients[0] + b * coefficients[1] + c * coefficients[2] + d * coefficients[3]
 
 
-# Every run of a plan traces its input several times; `jit` keeps the trace.
-@partial(jax.jit, static_argnames="derivative", inline=True)
-def evaluate(coefficients: Numbers, part: Numbers | float, derivative: int = 0) -> Numbers:
+# Every run of a plan traces its input several times; `jit` keeps the trace. By its name, the search for jumps knows that it
+# is smooth.
+@partial(jax.jit, static_argnames="derivative")
+def evaluate_spline(coefficients: Numbers, part: Numbers | float, derivative: int = 0) -> Numbers:
     """The value of a spline, or of its derivative, at parts of its whole length, held constant beyond its ends.
 
     Derivatives are with respect to the number of intervals passed.
@@ -502,8 +503,8 @@ class Drive(eqx.Module):
         part, and torque [N m]."""
         part = jnp.asarray(t) / self.duration
         per_second = (len(self.steering) - ORDER + 1) / self.duration
-        angle, rate = evaluate(self.steering, part), evaluate(self.steering, part, 1) * per_second
-        speed, force, torque = (evaluate(spline, part) for spline in (self.front_speed, self.force, self.torque))
+        angle, rate = evaluate_spline(self.steering, part), evaluate_spline(self.steering, part, 1) * per_second
+        speed, force, torque = (evaluate_spline(spline, part) for spline in (self.front_speed, self.force, self.torque))
         return angle, rate, speed, force, torque
 
     def held(
@@ -575,7 +576,7 @@ class Tracker(eqx.Module):
     def errors(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers, Numbers, Numbers]:
         """The planned stroller as seen from this one: distances [m] ahead and to the left, and the sine and the cosine of
         the angle to the left at which it heads."""
-        pose = evaluate(self.pose, jnp.asarray(t) / self.drive.duration)
+        pose = evaluate_spline(self.pose, jnp.asarray(t) / self.drive.duration)
         components = jnp.moveaxis(pose, -1, 0)
         axes = self.surface.axes
         heading, target = padded(components[axes:]), padded(components[:axes])

@@ -77,7 +77,9 @@ def test_a_place_may_be_a_point_in_space(surface, place):
     assert bool(RideModel.of(scene, launch_nearby, None).legal())
     np.testing.assert_allclose(scene.state(launch_nearby), scene.state(Launch(place, 0.7, 1.0)), atol=3e-11)
     launch_off_ground = Launch(tuple(point + 1e-4), 0.7, 1.0)
-    with pytest.raises(ValueError, match=r"distance = .* must be at (most|least) .*place from the surface"):
+    with pytest.raises(
+        ValueError, match=r"distance from the surface = .* must be at (most|least) .*on the surface up to"
+    ):
         scene.check(launch_off_ground)
     assert not bool(RideModel.of(scene, launch_off_ground, None).legal())
 

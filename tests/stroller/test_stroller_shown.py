@@ -26,6 +26,7 @@ BAD = [
     (lambda t, motion: (math.sin(t), 0.0), "cannot be traced by JAX"),
     (lambda t, motion: (np.asarray(t), 0.0), "cannot be traced by JAX"),
     (lambda t: (1.0, 0.0), r"must be a function \(t, motion\)"),
+    (lambda t, motion: motion.speed, r"one drive force .* and one steering torque .*, as a pair, not a number of type"),
     (lambda t, motion: 1.0, "must return"),
     (lambda t, motion: (1.0, 2.0, 3.0), "one drive force .* and one steering torque"),
     (lambda t, motion: (jnp.ones(2), 0.0), r"not shapes \[\(2,\), \(\)\]"),

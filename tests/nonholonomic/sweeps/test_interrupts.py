@@ -10,10 +10,12 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cheap_sweep import cheap_sweep, resumed
 
 from nonholonomic.command_line import INTERRUPTED, PATIENCE
+from nonholonomic.sweeps import Table
 from nonholonomic.sweeps._store import ChunkStore, Stored
 
 #: How long an answer to Ctrl-C may take [s]: twice as long where other programs keep all cores busy.
@@ -153,10 +155,12 @@ def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
     assert duration < PROMPT
     saved_blocks = len(blocks(path))
     assert 2 <= saved_blocks < 7
-    assert (
-        error[-1]
-        == f"KeyboardInterrupt: saved {8 * saved_blocks} of 50 cells to {path}; run the same call again to resume"
+    assert error[-1] == (
+        f"KeyboardInterrupt: saved {8 * saved_blocks} of 50 cells to {path}; run the same call again to resume, or read "
+        f"them from {path}.blocks with Table.load({str(path)!r})"
     )
+    statuses = Table.load(path).status
+    assert (statuses.size, np.sum(statuses == "pending")) == (50, 50 - 8 * saved_blocks)
     # The executor's processes print nothing.
     assert sum(line.startswith("Traceback") for line in error) == 1
     assert len(resumed(path)) == 7 - saved_blocks
@@ -200,7 +204,8 @@ def test_an_interrupt_during_garbage_collection_is_neither_lost_nor_printed_twic
     _, output, error = process.wait(timeout=60), *process.communicate()
     assert error.count("Traceback") == 1
     assert (process.returncode, output) == (-signal.SIGINT, "")
-    assert error.endswith("KeyboardInterrupt: saved 8 of 50 cells to table.h5; run the same call again to resume\n")
+    saved = "KeyboardInterrupt: saved 8 of 50 cells to table.h5; run the same call again to resume, or read them from "
+    assert error.endswith(f"{saved}table.h5.blocks with Table.load('table.h5')\n")
 
 
 def test_a_table_is_heard_while_it_compiles(tmp_path):
