@@ -538,7 +538,8 @@ class Trajectory(AbstractRun):
     @functools.cached_property
     def resets(self) -> Table:
         """The resets of the run, a `Table` with a row for each: its `time` [s], the indices `mode_before` and
-        `mode_after`, and the components of the state, such as `y0_before` and `y0_after`. The run is repeated for it.
+        `mode_after`, and the components of the state, such as `y0_before` and `y0_after`; with several margins also `margin`,
+        the name or the index of the one that fell. The run is repeated for it.
 
         **Raises:** `ValueError` inside transformations and for a batch of runs: `mode` and `switches` are there.
         """
@@ -556,11 +557,13 @@ class Trajectory(AbstractRun):
         columns = {"time": np.array([after.end_time[0] for _, after in resets], float)}
         for k, word in enumerate(("before", "after")):
             columns[f"mode_{word}"] = np.array([pair[k].mode[0] for pair in resets], int)
+        model: Any = self.model
         for k, word in enumerate(("before", "after")):
-            model: Any = self.model
             states = [model.components_of(jnp.asarray(pair[k].state[:, 0])) for pair in resets]
             components = np.array(states, float).reshape(-1, len(self.names))
             columns |= {f"{name}_{word}": components[:, part] for part, name in enumerate(self.names)}
+        if resets and max(model.form.traits.ends) > 1:
+            columns["margin"] = np.array([modes[before.mode[0]].fallen(before.state[:, 0]) for before, _ in resets])
         return Table({"reset": np.arange(1, len(resets) + 1)}, columns, {"time": "s"}, {})
 
     @property

@@ -218,6 +218,13 @@ class BatchedMode(AbstractBatchedMode):
         reset = eqx.filter_vmap(_after_reset, in_axes=axes, out_axes=-1)
         return reset(self, state, self._exit(stop_gradient(state)))
 
+    def fallen(self, state: Float[Array, " components"]) -> str:
+        """The name of the margin that ended the mode, or its index."""
+        # Not traced, as JAX would sort the names.
+        margin = self.form.function("margin", self.index)(self.numbers, *time_and_state(self.form, tuple(state)))
+        names = list(margin) if isinstance(margin, dict) else range(self.margins)
+        return str(names[int(eqx.filter_jit(BatchedMode._exit)(self, state[:, None])[0])])
+
     def _exit(self, state: Float[Array, "components cells"]) -> Int[Array, " cells"]:
         """The index of the margin that ended the mode: the first of those that are least up to round-off and fall."""
         if self.margins < 2:

@@ -75,7 +75,7 @@ class Beads(AbstractMode):
 
 def test_two_beads_strike_one_another_and_the_walls():
     """The reference takes the impacts one by one."""
-    place, speed, left = np.array([0.2, 0.7]), np.array([0.9, -0.4]), 10.0
+    place, speed, left, struck = np.array([0.2, 0.7]), np.array([0.9, -0.4]), 10.0, []
     while True:
         gaps = np.array([place[0], place[1] - place[0], 1.0 - place[1]])
         rates = np.array([speed[0], speed[1] - speed[0], -speed[1]])
@@ -84,10 +84,12 @@ def test_two_beads_strike_one_another_and_the_walls():
         if waits[exit] > left:
             break
         place, left = place + waits[exit] * speed, left - waits[exit]
+        struck.append(("wall", "beads", "end")[exit])
         speed = [speed * [-1, 1], np.array([[-0.5, 1.5], [0.5, 0.5]]) @ speed, speed * [1, -1]][exit]
     run = simulate(Hybrid([Beads()]), [0.2, 0.7, 0.9, -0.4], 10.0, times=[10.0])
     assert_close(run.state[0], np.concatenate([place + left * speed, speed]), atol=1e-9)
     assert np.all(np.diff(run.resets["time"]) >= 0.0)
+    assert run.resets["margin"].tolist() == struck
 
 
 class Block(AbstractSystem):
