@@ -3,6 +3,7 @@
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -180,7 +181,7 @@ def normal_scores(measurements: Measurements, prediction: PerPoint) -> PerPoint:
     """Residuals converted to numbers that are normal if the stated errors are right; 0 for limits."""
     from scipy.special import ndtri, stdtr
 
-    z = np.asarray(measurements.standardised(np.asarray(prediction)))
+    z = np.asarray(eqx.filter_jit(measurements.standardised)(np.asarray(prediction)))
     freedom = np.asarray(measurements.student)
     heavy = np.isfinite(freedom)
     return np.where(heavy, -np.sign(z) * ndtri(stdtr(np.where(heavy, freedom, 1.0), -np.abs(z))), z)

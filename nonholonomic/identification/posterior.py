@@ -108,7 +108,7 @@ class Measurements(eqx.Module):
         """Which measurements are limits, or pairs of limits."""
         return self.upper > self.value
 
-    def residuals(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    def residuals(self, prediction: Float[Array, "... n"], has_limits: bool = True) -> Float[Array, "... n"]:
         """Residuals whose squares are -2 log likelihood, up to a constant.
 
         For a measurement the residual is z = (prediction - value) / error, or with Student's t of nu degrees of freedom
@@ -117,7 +117,7 @@ class Measurements(eqx.Module):
         prediction is above the limit. Upper limits are the mirror image. `between` states the residual of two limits. A
         prediction that is not finite counts as `MISSING`, except that an infinite prediction exceeds a lower limit.
 
-        **Arguments:** `prediction`: (..., n). **Returns:** (..., n).
+        **Arguments:** `prediction`: (..., n); `has_limits`: false if no measurement is a limit. **Returns:** (..., n).
         """
         is_finite = jnp.isfinite(prediction)
         finite_prediction = jnp.where(is_finite, prediction, 0.0)
@@ -134,11 +134,10 @@ class Measurements(eqx.Module):
         is_small = share < 1e-8
         flat = jnp.where(is_small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(is_small, 1.0, share))
         of_value = jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
-        residuals = jnp.select(
-            [~self.censored, two_limits, low],
-            [of_value, between((finite_prediction - middle) / self.error, half), one_sided(excess)],
-            -one_sided(shortfall),
-        )
+        residuals = of_value
+        if has_limits:
+            choices = [of_value, between((finite_prediction - middle) / self.error, half), one_sided(excess)]
+            residuals = jnp.select([~self.censored, two_limits, low], choices, -one_sided(shortfall))
         is_exceeded = low & ~high & (prediction == jnp.inf)
         return jnp.where(is_finite, residuals, jnp.where(is_exceeded, 0.0, MISSING))
 
@@ -457,7 +456,7 @@ class Problem(eqx.Module):
         self.model, self.names, self.step, self.on_host = model, tuple(free), step, getattr(model, "on_host", False)
         self.unknowns, self.acts = Unknowns(free, priors), np.ones(len(free), bool)
 
-    def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
+    def predict(self, coordinates: Float[Array | np.ndarray, "rows unknowns"]) -> Float[Array, "rows n"]:
         """The model's predictions in every row.
 
         **Raises:** `ValueError` inside a transformation, if the model cannot be traced.
@@ -515,7 +514,7 @@ def predictions(problem: Problem, coordinates: Rows) -> np.ndarray:
     if problem.on_host and len(problem.names) == 1:
         # Rounds are small, and calls take nearly as long for fewer rows: the cores share a round.
         rows = ROWS_OF_CALL // 2
-    return _in_parts(lambda part: (predict(problem, jnp.asarray(part)),), coordinates, rows)[0]
+    return _in_parts(lambda part: (predict(problem, part),), coordinates, rows)[0]
 
 
 def _in_parts(
@@ -597,14 +596,17 @@ def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]
         return np.pad(values, (0, -values.size % COMPARED), mode="edge").reshape(-1, COMPARED)
 
     lists = jax.tree.map(listed, (measurements, prediction))
-    parts = [_residuals(*jax.tree.map(lambda values, k=k: values[k], lists)) for k in range(len(lists[1]))]
+    # The program of limits takes three times as long to compile.
+    has_limits = bool(np.any(np.asarray(measurements.censored)))
+    parts = [_residuals(*jax.tree.map(lambda values, k=k: values[k], lists), has_limits) for k in range(len(lists[1]))]
     results = [np.concatenate(values)[: prediction.size] for values in zip(*parts, strict=True)]
     return [values.reshape(prediction.shape) for values in results]
 
 
 @eqx.filter_jit
-def _residuals(measurements: Measurements, prediction: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-    residual, slope = jax.jvp(measurements.residuals, (prediction,), (jnp.ones_like(prediction),))
+def _residuals(measurements: Measurements, prediction: Float[Array, " n"], has_limits: bool) -> tuple[Array, ...]:
+    ones = jnp.ones_like(prediction)
+    residual, slope = jax.jvp(lambda value: measurements.residuals(value, has_limits), (prediction,), (ones,))
     return residual, slope, measurements.roots_of_information(prediction, slope)
 
 

@@ -319,7 +319,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         for deviance, has_converged in zip(deviances, ends.converged, strict=True)
     )
     # The slopes of the parameters with respect to their coordinates.
-    slopes = np.asarray(jax.jvp(problem.unknowns.values, (optimum,), (np.ones_like(optimum),))[1])
+    slopes = np.asarray(eqx.filter_jit(jax.jvp)(problem.unknowns.values, (optimum,), (np.ones_like(optimum),))[1])
     by_slopes = ends.covariance(best)
     distribution = Distribution.of(optimum, by_slopes, sample)
     likely, covariance = problem.unknowns.values(optimum), distribution.covariance_of_values(problem, slopes)

@@ -419,7 +419,9 @@ def _predicted_by_tables(
         order = np.argsort(~is_legal, kind="stable")
         order[count:] = order[0]
         cells, t1 = jax.tree.map(lambda leaf: leaf[order] if eqx.is_array(leaf) else leaf, (model, horizon))
-        status, time, ends = first_events(cells, np.asarray(t1), size, count, settings)
+        # Without cells, new programs are compiled together, and others take no time.
+        for first in (0, count):
+            status, time, ends = first_events(cells, np.asarray(t1), size, first, settings)
         time = data.of_ends(cells, t1, time, ends)
         predictions[order[:count]] = np.where(np.isin(status, SILENT), np.nan, time)[:count]
     return jnp.asarray(predictions)

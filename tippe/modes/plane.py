@@ -79,22 +79,18 @@ class Descent(NamedTuple):
 
     def value(self, time: Lanes) -> Lanes:
         angle = self.rate * time
-        swing = 2.0 * self.cosine * jnp.sin(0.5 * angle) ** 2 + self.sine * angle_less_sine(angle)
+        # angle - sin(angle), without cancellation where the angle is small.
+        square, series = angle * angle, 1.0
+        for k in (14, 12, 10, 8, 6, 4):
+            series = 1.0 - square / (k * (k + 1)) * series
+        less_sine = jnp.where(jnp.abs(angle) < 0.5, angle * square / 6.0 * series, angle - jnp.sin(angle))
+        swing = 2.0 * self.cosine * jnp.sin(0.5 * angle) ** 2 + self.sine * less_sine
         return self.start + time * (self.speed - 0.5 * self.gravity * time) - swing
 
     def slope(self, time: Lanes) -> Lanes:
         angle = self.rate * time
         swing = self.cosine * jnp.sin(angle) + self.sine * 2.0 * jnp.sin(0.5 * angle) ** 2
         return self.speed - self.gravity * time - self.rate * swing
-
-
-def angle_less_sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
-    """x - sin x, without cancellation where x is small."""
-    square = angle * angle
-    series = 1.0
-    for k in (14, 12, 10, 8, 6, 4):
-        series = 1.0 - square / (k * (k + 1)) * series
-    return jnp.where(jnp.abs(angle) < 0.5, angle * square / 6.0 * series, angle - jnp.sin(angle))
 
 
 def precession(body: Top, free: FreeBody) -> tuple[Vector, Float[Array, "..."]]:
@@ -165,24 +161,25 @@ def landing(descent: Descent, max_time: Lanes) -> tuple[Lanes, Bool[Array, " cel
     bend = jnp.arccos(-jnp.minimum(ratio, 1.0))
     has_no_inflection = ratio >= 1.0
 
-    def next_inflection(time: Lanes) -> Lanes:
-        angles = [jnp.mod(mode + side * bend - rate * time, 2.0 * jnp.pi) for side in (1.0, -1.0)]
-        # Skip the inflection just reached.
-        angles = [jnp.where(angle < 1e-9, 2.0 * jnp.pi, angle) for angle in angles]
-        return jnp.where(
-            has_no_inflection, jnp.inf, time + jnp.minimum(*angles) / jnp.where(has_no_inflection, 1.0, rate)
-        )
-
     def search(carry):
         low, high, located, is_over, count = carry
         start = jnp.where((low > high_from) & (low < high_to), high_to, low)
-        next_time = jnp.minimum(next_inflection(start), end)
+        angles = [jnp.mod(mode + side * bend - rate * start, 2.0 * jnp.pi) for side in (1.0, -1.0)]
+        # Skip the inflection just reached.
+        angles = [jnp.where(angle < 1e-9, 2.0 * jnp.pi, angle) for angle in angles]
+        wait = jnp.where(has_no_inflection, jnp.inf, jnp.minimum(*angles) / jnp.where(has_no_inflection, 1.0, rate))
+        next_time = jnp.minimum(start + wait, end)
         ends_below = descent.value(next_time) < 0.0
         dips = (descent.slope(start) < 0.0) & (descent.slope(next_time) > 0.0)
-        bottom = halved(lambda t: descent.slope(t) < 0.0, start, next_time)[1]
+        active = ~located & ~is_over
+        # Few flights dip before they land.
+        bottom = jax.lax.cond(
+            jnp.any(active & dips),
+            lambda: halved(lambda t: descent.slope(t) < 0.0, start, next_time)[1],
+            lambda: next_time,
+        )
         dips &= descent.value(bottom) < 0.0
         is_hit = ends_below | dips
-        active = ~located & ~is_over
         low = jnp.where(active, jnp.where(is_hit, start, next_time), low)
         high = jnp.where(active & is_hit, jnp.where(dips, bottom, next_time), high)
         return low, high, located | (active & is_hit), is_over | (active & ~is_hit & (next_time >= end)), count + 1
@@ -196,13 +193,6 @@ def landing(descent: Descent, max_time: Lanes) -> tuple[Lanes, Bool[Array, " cel
     # At the very start, the distance is zero: it must have been positive since.
     time = halved(lambda t: descent.value(t) >= 0.0, low, high)[1]
     return jnp.where(located, time, jnp.inf), ~located & ~is_over
-
-
-def landed_at(descent: Descent, time: Lanes) -> Lanes:
-    """A time at which the distance is zero, with its derivatives (implicit function theorem)."""
-    value, slope = descent.value(time), stop_gradient(descent.slope(time))
-    is_regular = jnp.isfinite(time) & (slope < 0.0)
-    return time - jnp.where(is_regular, (value - stop_gradient(value)) / jnp.where(is_regular, slope, 1.0), 0.0)
 
 
 def _roots(height: Lanes, speed: Lanes, gravity: Lanes) -> tuple[Lanes, Lanes, Bool[Array, " cells"]]:
@@ -281,7 +271,11 @@ def take_flight(
         descent = _descent(body, gravity, ball, free, (air.ball == number) & ~air.rising, air.ball == number)
         # The search is by bisection, which has no derivative.
         time, given_up = landing(*stop_gradient((descent, max_time)))
-        times.append(landed_at(descent, time))
+        # The derivatives of the time are those of an implicit function.
+        value, slope = descent.value(time), stop_gradient(descent.slope(time))
+        is_regular = jnp.isfinite(time) & (slope < 0.0)
+        late = jnp.where(is_regular, (value - stop_gradient(value)) / jnp.where(is_regular, slope, 1.0), 0.0)
+        times.append(time - late)
         speeds.append(-descent.slope(jnp.where(jnp.isfinite(time), times[-1], 0.0)))
         has_failed |= given_up
     first, time = jnp.argmin(jnp.stack(times), axis=0), jnp.min(jnp.stack(times), axis=0)

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
@@ -160,17 +160,11 @@ def stick_slip_modes(
     laws = (stick_slip.slipping, stick_slip.rolling, stick_slip.mu, jnp.asarray(tolerance, float))
     options = (problem.cos_angle, problem.scales, last, size, passive, problem.spin, scene if flies else None)
     slips, rolls = (StickSlipMode(ContactMode(*laws, rolls=rolls), *options) for rolls in (False, True))
-    rests = _rests(stick_slip, problem.states[:size])
+    rests = compiled_setup(stick_slip.rests)(problem.states[:size])
     if not flies:
         return (slips, rolls), jnp.where(rests, ROLLING, SLIPPING)
     land = Land(scene, problem.scales, problem.cos_angle, with_quadratures)
     return (slips, land, rolls), jnp.where(rests, TOUCH_ROLLING, TOUCH_SLIPPING)
-
-
-@compiled_setup
-def _rests(stick_slip: StickSlip, states: States) -> Bool[Array, " cells"]:
-    """Whether the contact of each cell is at rest."""
-    return stick_slip.rests(states)
 
 
 # Convert the final states of runs over any arena to states in contact, and compute their energy and why a contact
