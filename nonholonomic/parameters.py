@@ -85,9 +85,8 @@ def with_numbers(roots: dict[str, PyTree], values: Mapping[str, ArrayLike]) -> d
     **Raises:** `ValueError` for a name that matches no parameter.
     """
     values_of_names = numbers_of(roots)
-    unknown = [name for name in values if name not in values_of_names]
-    if unknown:
-        raise _unknown_axis(unknown[0], [name for name, value in values_of_names.items() if value is not None])
+    for unknown in [name for name in values if name not in values_of_names]:
+        full_name("unknown axis", unknown, [name for name, value in values_of_names.items() if value is not None])
     return {root: _replaced(root, tree, values) for root, tree in roots.items()}
 
 
@@ -140,9 +139,8 @@ def full_name(argument: str, name: str, known: list[str]) -> str:
     """
     matches = meant(name, known)
     if len(matches) != 1:
-        ends = [candidate.rsplit(".", 1)[-1] for candidate in known]
-        hint = likely(str(name).rsplit(".", 1)[-1], ends)
-        problem = f"could be {' or '.join(matches)}" if matches else f"must be one of {', '.join(known)}{hint}"
+        several = " or ".join(matches)
+        problem = f"could be {several}" if matches else f"must be one of {', '.join(known)}{_hint(name, known)}"
         raise ValueError(f"{argument}: {name!r} {problem}")
     return matches[0]
 
@@ -174,9 +172,7 @@ def full_axes(axes: dict[str, Axis], known: list[str]) -> dict[str, Axis]:
     """
     by_full_name: dict[str, Axis] = {}
     for name, values in axes.items():
-        if not meant(name, known):
-            raise _unknown_axis(name, known)
-        full = full_name("axes", name, known)
+        full = full_name("axes" if meant(name, known) else "unknown axis", name, known)
         if full in by_full_name:
             raise ValueError(f"axes: {full!r} is named twice")
         by_full_name[full] = values
@@ -188,12 +184,12 @@ def meant(name: Any, known: Sequence[str]) -> list[str]:
     return [name] if name in known else [known_name for known_name in known if known_name.endswith("." + str(name))]
 
 
-def _unknown_axis(name: str, known: list[str]) -> ValueError:
-    suffixes = {full.rsplit(".", 1)[-1]: full for full in known}
-    return ValueError(
-        f"unknown axis {name!r}: the numbers that can be varied are {', '.join(known)}"
-        f"{likely(name.rsplit('.', 1)[-1], suffixes)}"
-    )
+def _hint(name: object, known: Sequence[str]) -> str:
+    """What an unknown name may mean, as an addition to a message: the numbers of a module, or a similar name."""
+    parts = [full[full.index(f".{name}.") + 1 :] for full in known if f".{name}." in full]
+    if parts:
+        return f"; did you mean {' or '.join(map(repr, parts[:3]))}?"
+    return likely(str(name).rsplit(".", 1)[-1], [full.rsplit(".", 1)[-1] for full in known])
 
 
 def _replaced(name: str, tree: PyTree, values: Mapping[str, Any]) -> PyTree:

@@ -172,9 +172,9 @@ def require(
         allowed = holds(numbers, limits)
         if not np.all(allowed):
             number = _first(numbers, allowed)
-            message = f"{name} = {number} must be {words} {_first(limits, allowed)}{remark}"
-            degrees = unit == "rad" and bound is at_most
-            raise ValueError(message + (IN_DEGREES.format(number) if degrees else ""))
+            degrees = IN_DEGREES.format(number) if unit == "rad" and bound is at_most else ""
+            limit = _first(limits, allowed).replace(str(np.pi), "pi rad")
+            raise ValueError(f"{name} = {number} must be {words} {limit}{remark}{degrees}")
 
 
 def require_scalars(values: Mapping[str, Any], otherwise: str) -> None:
@@ -409,12 +409,8 @@ def explaining(constructor: Constructor) -> Constructor:
                 unknown = [name for name in named if name not in known and not takes_all]
                 wrong = [f"{name} = {shown(named[name])} is not among them{likely(name, known)}" for name in unknown]
                 advice = [cls.advice[name] for name in cls.advice if name in unknown or f"'{name}'" in str(error)]
-                words = [
-                    f"{shown(function)} takes {', '.join(known)}",
-                    *(wrong or [str(error)]),
-                    *dict.fromkeys(advice),
-                ]
-                raise TypeError("; ".join(words)) from None
+                words = [*(wrong or [str(error)]), *dict.fromkeys(advice)]
+                raise TypeError(f"{shown(function)} takes {', '.join(known)}; {'; '.join(words)}") from None
             raise
 
     return explained  # pyright: ignore[reportReturnType]

@@ -46,6 +46,13 @@ class Leaving(nonholonomic.AbstractMode):
         return y + 1.0, 5
 
 
+class Nameless(nonholonomic.AbstractSystem):
+    """A system without its number of coordinates."""
+
+    def metric(self, q):
+        return jnp.eye(1)
+
+
 REFUSED = {
     "the other package's scene": (
         lambda: tippe.simulate(PRAM, LAUNCH, 1.0),
@@ -77,7 +84,23 @@ REFUSED = {
     ),
     "degrees": (
         lambda: tippe.Launch(5.0, 100.0),
-        "theta = 5.0 must be at most 3.141592653589793; angles are in radians: did you mean np.radians(5.0)?",
+        "theta = 5.0 must be at most pi rad; angles are in radians: did you mean np.radians(5.0)?",
+    ),
+    "a law for a number": (
+        lambda: nonholonomic.identify(
+            tippe.Scene(rutstam_top(), friction=tippe.Coulomb(0.3, 0.05)),
+            tippe.Recording(LAUNCH, [0.1, 0.2], [0.1, 0.1], 0.01),
+            {"friction": 0.3},
+        ),
+        "t0; did you mean 'friction.mu' or 'friction.slip_speed'?",
+    ),
+    "more than half a turn in degrees": (
+        lambda: tippe.Recording(LAUNCH, [0.1, 0.2], np.radians([6.0, 200.0]), 0.01),
+        "theta = 200 deg at 0.2 s (sample 2) must be, with room for its errors, between 0 and 180 deg",
+    ),
+    "no dimension": (
+        lambda: nonholonomic.simulate(Nameless(), ([1.0], [0.0]), t1=1.0),
+        "Nameless has no dimension: write `dimension = 1`, its number of coordinates",
     ),
     "degrees of the place": (lambda: tippe.Launch(0.1, 100.0, eta=90.0), "did you mean np.radians(90.0)?"),
     "degrees of the tilt": (lambda: tippe.Plane(10.0), "did you mean np.radians(10.0)?"),

@@ -160,9 +160,8 @@ class AbstractTimes(AbstractEventTimes):
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, " or a list of launches")
         # What is no number is refused later.
-        seconds = (
-            np.asarray(self.time) if isinstance(self.time, jax.Array) and not is_traced(self.time) else np.zeros(0)
-        )
+        is_known = isinstance(self.time, jax.Array) and not is_traced(self.time)
+        seconds = np.asarray(self.time) if is_known else np.zeros(0)
         if np.any(np.isfinite(seconds)) and (middle := np.median(seconds[np.isfinite(seconds)])) > LONG:
             warn(f"time = {middle:g} s is long for a top; times are in seconds: did you mean 1e-3 * time?")
 
@@ -410,11 +409,15 @@ class Recording(AbstractRecording):
         seen = ~np.isnan(theta)
         is_outside = seen & ((theta < -reach) | (theta > math.pi + reach))
         for row in np.flatnonzero(is_outside)[:1]:
-            raise ValueError(
-                f"theta = {theta[row]:g} at {float(self.times[row]):.6g} s (sample {row + 1}) must be between 0 and pi rad, "
-                f"with room for its errors: was it recorded in degrees? Pass np.radians({theta[row]:g}), or the unit 'deg' "
-                "when you read a file"
+            number, degrees = f"{theta[row]:g}", math.degrees(theta[row])
+            hint = (
+                f"pi rad: was it recorded in degrees? Pass np.radians({number}), or the unit 'deg' when you read a file"
             )
+            # Radians of round degrees were in degrees before.
+            if abs(degrees - round(degrees, 3)) < 1e-9:
+                number, hint = f"{degrees:g} deg", "180 deg"
+            place = f"{number} at {float(self.times[row]):.6g} s (sample {row + 1})"
+            raise ValueError(f"theta = {place} must be, with room for its errors, between 0 and {hint}")
 
 
 def read_recording(

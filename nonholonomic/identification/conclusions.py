@@ -71,11 +71,10 @@ class Verdict(NamedTuple):
 
     def __str__(self) -> str:
         """Whether to believe the fit, and what to do; `Identification.details` has the statistics."""
-        notes = f", {counted(len(self.notes), 'note')} in its details" if self.notes else ""
-        return (
-            f"do not rely on this fit yet: {'; '.join(self.concerns)}"
-            if self.concerns
-            else f"no concerns about this fit{notes}"
+        if self.concerns:
+            return f"do not rely on this fit yet: {'; '.join(self.concerns)}"
+        return "no concerns about this fit" + (
+            f", {counted(len(self.notes), 'note')} in its details" if self.notes else ""
         )
 
 
@@ -114,6 +113,8 @@ def judge(
     region = explorer.region
     is_outside = np.abs(distribution.estimate - region.middle) > region.half_width
     outside = ", ".join(np.array(explorer.density.problem.names)[is_outside])
+    fixed = " and ".join(getattr(explorer.density.problem.model, "fixed", ()))
+    fixed += ", held fixed, may be wrong (free them, with priors), " if fixed else ""
     impossible, share = without_prediction(explorer, sample, distribution)
     minima, concerns, notes = (), (), ()
     if distribution.kind == "weights":
@@ -130,8 +131,8 @@ def judge(
             (missing, f"the model has no prediction for {missing} measurements: its run ends earlier, or fails"),
             (
                 p_value < POOR,
-                f"the residuals are too large (p = {p_value:.2g}): the model is wrong, the errors are too small, "
-                "or this is not the best minimum",
+                f"the residuals are too large (p = {p_value:.2g}), so the intervals are not valid: {fixed}the model is wrong, "
+                "the errors are too small, or this is not the best minimum",
             ),
             (violated, f"{violated} limits are violated by more than {FAR:.0f} errors"),
             (

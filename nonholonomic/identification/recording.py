@@ -192,7 +192,7 @@ class AbstractRecording(AbstractData):
             if np.ndim(self.student) != 0:
                 raise ValueError(f"student must be one number, not of shape {np.shape(self.student)}")
         # Unusual units: samples too far apart for seconds, and angles too large for radians.
-        if self.quantities.usual and len(times) > 2 and (apart := np.median(np.diff(times))) > FAR_APART:
+        if self.quantities.usual and len(times) > 1 and (apart := np.median(np.diff(times))) > FAR_APART:
             warn(f"times: samples are {apart:g} s apart; times are in seconds: did you mean 1e-3 * times?")
         samples = np.abs(np.asarray(self.value)).reshape(len(times), -1)
         for name in (name for name in self.quantities.usual if name in self.columns):
@@ -470,6 +470,8 @@ class TextTable(NamedTuple):
 def _text(path: Path) -> str:
     """The text of a file in UTF-8, or as spreadsheets write it: in UTF-16 with a mark, or in Windows' encoding."""
     raw = path.read_bytes()
+    if raw.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
+        raise ValueError(f"path = {str(path)!r} is an Excel file, or another archive: save the sheet as CSV")
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16", errors="replace")
     try:

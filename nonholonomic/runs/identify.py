@@ -282,12 +282,14 @@ class Source(eqx.Module):
 class DataModel(eqx.Module):
     """Predictions of several sets of data of a system, in the form that `nonholonomic.identification.result` expects.
 
-    `seen`: indices of the predictions that were measured.
+    `seen`: indices of the predictions that were measured; `fixed`: the numbers of the first start that are neither zero nor
+    among the unknowns.
     """
 
     data: tuple[Source, ...]
     seen: Int[Array | np.ndarray, " n"]
     settings: Settings
+    fixed: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def recorded(self) -> tuple[Data, ...]:
@@ -584,7 +586,10 @@ def posterior_of_runs(
     require_apart("free", unknowns)
     offsets = np.cumsum([0, *(source.size for source in several)])
     seen = np.concatenate([first + source.seen for first, source in zip(offsets, several, strict=False)])
-    model = DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS))
+    first, own = sources[0].model, set(map(own_name, unknowns))
+    starts = [name for name in first.known if name.startswith(("launch.", "start")) and name not in own]
+    fixed = tuple(name for name in starts if np.any(first.value(name)))
+    model = DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS), fixed)
     if priors is not None and not isinstance(priors, dict):
         raise ValueError(
             f"priors = {shown(priors)} must be a dictionary, name of a number -> (mean, standard deviation), only the standard "

@@ -156,9 +156,9 @@ class AbstractSystem(eqx.Module):
     names: ClassVar[tuple[str, ...] | None] = None
 
     @property
-    @abc.abstractmethod
     def dimension(self) -> int:
         """Number n of coordinates."""
+        raise ValueError(f"{type(self).__name__} has no dimension: write `dimension = 1`, its number of coordinates")
 
     @property
     def freedom(self) -> int:

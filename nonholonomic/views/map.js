@@ -4,6 +4,11 @@
 function makeMap(box, live, integrator, choose) {
   const across = 40, up = 30, levels = [8, 4, 2, 1], chunk = 24;
   const { sliders, words, answer } = live.facts;
+  // A single slider has no map.
+  if (sliders.length < 2) {
+    box.hidden = true;
+    return { update() {}, results: () => [], done: () => true, cells: [], at: () => [] };
+  }
   const [canvas, legend, selects] = [box.querySelector("canvas"), box.querySelector("#legend"), box.querySelectorAll("select")];
   const colours = { not_inverted: "#dde1e6", not_reversed: "#dde1e6", completed: "#dde1e6", contact_lost: "#e9a23b", failed: "#c8412b", jammed: "#8c5a3c",
     does_not_fit: "#7b4fa3", unresolved: "#c8412b", rank_lost: "#7b4fa3", illegal: "#ffffff" };
@@ -16,7 +21,7 @@ function makeMap(box, live, integrator, choose) {
       if (k === 0 || x % levels[k - 1] || y % levels[k - 1]) found.push({ x, y, level });
     return found;
   });
-  let values = sliders.map((slider) => slider.value), axes = [0, Math.min(1, sliders.length - 1)], results = [], round = 0, next = 0;
+  let values = sliders.map((slider) => slider.value), axes = [0, 1], results = [], round = 0, next = 0;
 
   // Each worker gets a program made from the page's own text, so that the page works from disk.
   const text = (part) => typeof part === "function" ? String(part) : Array.isArray(part) ? `[${part.map(text)}]`
@@ -137,7 +142,6 @@ function makeMap(box, live, integrator, choose) {
   }
   selects.forEach((select, k) => {
     sliders.forEach((slider, number) => select.add(new Option(`${k ? "↑" : "→"} ${slider.label}`, number)));
-    select.hidden = sliders.length < 2;
     select.addEventListener("change", () => {
       const wanted = Number(select.value), other = axes[1 - k];
       // Two equal axes would give a line, so exchange them instead.

@@ -186,7 +186,7 @@ def test_axes_of_one_name_are_told_apart():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (dict(axes={"scene.body.colour": [1.0]}), r"unknown axis 'scene\.body\.colour'"),
+        (dict(axes={"scene.body.colour": [1.0]}), r"unknown axis: 'scene\.body\.colour'"),
         (dict(axes={"launch.speed": []}), r"speed must be a number or a non-empty list"),
         (dict(axes={"scene.body.mass": [1.0, -1.0]}), r"mass = .* must be greater than 0\.0"),
         (dict(axes={"launch.place[1]": [0.0, 2.0]}), r"place\[1\] = .* must be at most 1\.57"),

@@ -221,7 +221,7 @@ def test_every_scene_compiles(arena, law, asked):
         ({"theta": [0.1, 3.2]}, "theta = .* must be at most 3.14159"),
         ({"theta": [[0.1]]}, "theta must be a number or a non-empty list"),
         ({"mu": [-0.1, 0.2]}, "mu = .* must be at least 0.0"),
-        ({"axes": {"scene.body.weight": [1.0]}}, "unknown axis 'scene.body.weight': .*scene.body.mass"),
+        ({"axes": {"scene.body.weight": [1.0]}}, "unknown axis: 'scene.body.weight' .*scene.body.mass"),
         ({"axes": {"scene.body.offset": [0.006, 0.03]}}, "offset = .* must be less than 0.02"),
         ({"method": "magic"}, "method = 'magic' must be"),
         ({"crossing": "last", "method": "diffrax"}, "crossing = 'last' must be 'first'"),
@@ -238,7 +238,7 @@ def test_bad_tables_are_refused_before_anything_compiles(rutstam_scene_module, c
 
 def test_a_frictionless_scene_has_no_mu_to_vary():
     scene = tippe.Scene(rutstam_top())
-    with pytest.raises(ValueError, match=r"unknown axis 'scene\.friction\.mu'"):
+    with pytest.raises(ValueError, match=r"unknown axis: 'scene\.friction\.mu'"):
         tippe.inversion_table(scene, theta=0.1, spin=100.0, mu=[0.1, 0.2], t1=1.0)
 
 

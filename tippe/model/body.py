@@ -138,30 +138,30 @@ def half_ball(radius: Number, centre: Number) -> Moments:
 ASSUMED = {"cut": "cut = 0.35 radius + 1.1 stem_radius", "stem_length": "stem_length 5 % beyond where the rim touches"}
 
 
-def _turned(lengths: dict[str, Any]) -> tuple[Number, ...]:
+def _turned(lengths: dict[str, Any], xp=jnp) -> tuple[Number, ...]:
     """Volume, offset, axial and transverse moments with density 1, and the height of the stem's end above the centre of
-    the sphere. **Arguments and errors:** as for `Top.turned`."""
+    the sphere. **Arguments and errors:** as for `Top.turned`; `xp`: `numpy` for many quick trials."""
     for name, length in lengths.items():
         if length is not None or name not in ASSUMED:
             require(length, name, above=None if name.startswith("hole") else 0.0, at_least=0.0)
     is_drilled = bool(lengths["hole_radius"] or lengths["hole_depth"])
     names = ("radius", "stem_radius", "hole_radius", "hole_depth")
-    radius, stem_radius, hole_radius, hole_depth = (as_number(lengths[name]) for name in names)
-    usual_cut = 0.35 * radius + 1.1 * jnp.minimum(stem_radius, 0.45 * radius)
-    cut = usual_cut if lengths["cut"] is None else as_number(lengths["cut"])
+    radius, stem_radius, hole_radius, hole_depth = (xp.asarray(lengths[name], dtype=float) for name in names)
+    usual_cut = 0.35 * radius + 1.1 * xp.minimum(stem_radius, 0.45 * radius)
+    cut = usual_cut if lengths["cut"] is None else xp.asarray(lengths["cut"], dtype=float)
     require(cut, "cut", below=radius, why="the radius of the sphere")
-    rim = jnp.sqrt(radius**2 - cut**2)
+    rim = xp.sqrt(radius**2 - cut**2)
     require(stem_radius, "stem_radius", below=rim, why="the radius of the flat that the cut leaves")
     # The height of the centre of the stem's end. On the level plane, sphere and stem touch together where cos(theta) is
     # (stem_radius - radius) / tip; the rim touches where it is -cut / radius.
     least_tip = radius * (radius - stem_radius) / cut
     usual_length = 1.05 * least_tip - cut + stem_radius
-    stem_length = usual_length if lengths["stem_length"] is None else as_number(lengths["stem_length"])
+    stem_length = usual_length if lengths["stem_length"] is None else xp.asarray(lengths["stem_length"], dtype=float)
     require(stem_length, "stem_length", above=stem_radius, why="the stem ends in a half ball")
     if is_drilled:
         require(hole_radius, "hole_radius", above=stem_radius, why="the hole is drilled around the stem")
         require(hole_radius, "hole_radius", below=rim, why="the radius of the flat that the cut leaves")
-        wall = cut + jnp.sqrt(radius**2 - hole_radius**2)
+        wall = cut + xp.sqrt(radius**2 - hole_radius**2)
         require(hole_depth, "hole_depth", above=0.0, below=wall, why="the hole must not pierce the sphere")
     tip = cut + stem_length - stem_radius
     reason = "else the rim of the cut touches the table before the stem; lengthen the stem, or cut less off"
@@ -190,7 +190,7 @@ def _remedy(lengths: dict[str, Any], message: str) -> str:
         for power in (sign * k for k in range(50) for sign in (1, -1)):
             number = f"{start * 1.03**power:.3g}"
             with contextlib.suppress(ValueError):
-                _turned(lengths | {name: float(number)})
+                _turned(lengths | {name: float(number)}, np)
                 return f"{message}; {name} = {number} would do"
     return message
 
