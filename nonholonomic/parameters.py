@@ -20,7 +20,7 @@ from jax.tree_util import DictKey
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .compilation.components import Held
-from .text import Numbers, gathered, likely, name_of, spread
+from .text import Numbers, Stated, gathered, likely, name_of, spread, unit_of
 
 #: The values of a parameter along an axis of a grid.
 Axis = TypeVar("Axis")
@@ -92,7 +92,7 @@ def with_numbers(roots: dict[str, PyTree], values: Mapping[str, ArrayLike]) -> d
 
 def as_one(values: Any, name: str, kind: type) -> Any:
     """Several modules of one kind, such as launches, as one whose numbers are lists, with one value for each module.
-    Anything but a list of such modules stays unchanged.
+    Anything but a list of such modules stays unchanged. The module is shown in the units of the first.
 
     **Arguments:** `name`: name of the list in messages.
 
@@ -114,7 +114,7 @@ def as_one(values: Any, name: str, kind: type) -> Any:
             stacked[field.name] = tuple(_column(row, name, field.name) for row in rows)
         else:
             stacked[field.name] = None if None in parts else _column(parts, name, field.name)
-    return kind(**stacked)
+    return kind(**stacked).stated_in(unit_of(values[0])) if issubclass(kind, Stated) else kind(**stacked)
 
 
 #: Parts of a launch that are zero where they are left out.

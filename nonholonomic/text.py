@@ -8,7 +8,7 @@ import math
 import operator
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import equinox as eqx
 import jax
@@ -176,6 +176,28 @@ def in_unit(si: str, unit: Unit) -> tuple[str, float]:
     return si, 1.0
 
 
+class Stated(eqx.Module):
+    """A module that may know the units in which its user stated it, for texts and pictures. They are no field: neither the
+    programs nor the gradients of a module have units, and copies are shown in SI units."""
+
+    __slots__ = ("_unit",)
+
+    def stated_in(self, unit: tuple[str, ...]) -> Self:
+        """This module, which is shown in these units from now on."""
+        object.__setattr__(self, "_unit", unit)
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Pickle could not set the attribute of a frozen module.
+        return dict(vars(self))
+
+
+def unit_of(*values: object) -> tuple[str, ...]:
+    """The units in which a user stated launches and data, or the launches of data, models and runs; empty for SI units."""
+    stated = [part for value in values for part in (value, getattr(value, "launch", None)) if isinstance(part, Stated)]
+    return tuple(unit for part in stated for unit in getattr(part, "_unit", ()))
+
+
 def _with_rates(unit: Unit) -> list[str]:
     """The units that a user names, and then the rates that they imply."""
     names = [SYNONYMS.get(name, name) for name in ([unit] if isinstance(unit, str) else unit or ())]
@@ -276,7 +298,7 @@ def contents(module: PyTree, with_units: bool = True) -> list[tuple[str, str]]:
             # A launch knows in which units it was stated.
             unit, factor = units.get(field.name, "1"), 1.0
             if not isinstance(value, tuple):
-                unit, factor = in_unit(unit, getattr(module, "shown_in", None))
+                unit, factor = in_unit(unit, unit_of(module))
                 value = value if factor == 1.0 else factor * value
             rows.append((field.name, as_text(value, unit if with_units else None)))
     return rows

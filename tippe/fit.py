@@ -27,7 +27,7 @@ from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers
 from nonholonomic.runs.identify import AbstractEventTimes, Cells, Data, Prior, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel
-from nonholonomic.text import distinguishing_labels
+from nonholonomic.text import distinguishing_labels, unit_of
 from nonholonomic.validation import as_number, is_traced, require_kind, require_scalars, warn
 
 from .model.scene import Launch, Scene, as_launch
@@ -171,12 +171,10 @@ class AbstractTimes(AbstractEventTimes):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A label for each launch."""
-        theta, spin, _ = np.broadcast_arrays(self.launch.theta, self.launch.spin, np.zeros(self.size))
-        return tuple(f"theta {angle:.4g}, spin {rate:.4g}" for angle, rate in zip(theta, spin, strict=True))
+        """What differs between the launches."""
+        return self.labels_in(unit_of(self.launch))
 
     def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
-        """What differs between the launches."""
         launches = [
             jax.tree.map(lambda leaf, k=k: leaf if jnp.ndim(leaf) == 0 else leaf[k], self.launch)
             for k in range(self.size)

@@ -21,9 +21,9 @@ from ..compilation.xla_cpu import opened, programs_in
 from ..integration import Settings
 from ..integration.problem import DEFAULT_MAX_STEPS, Status, require_times
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
-from ..sweeps.grid import EQUATIONS, columns
+from ..sweeps.grid import EQUATIONS, SHOWN_IN, columns
 from ..sweeps.table import cells_with
-from ..text import likely, shown
+from ..text import likely, shown, unit_of
 from ..validation import as_number, require_flag, require_outside, require_whole, warn
 from .event import Ensemble
 from .model import AbstractModel, AbstractSceneModel, Number, check_horizon, model_of, require_event, settings_for_lanes
@@ -283,6 +283,7 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
     request = job.model.description() | {axis.number: "an axis" for axis in grid} | request
     integrator = job.settings.for_single_runs if job.by_diffrax else job.settings.for_lanes
     request |= {"tolerance": float(options.tolerance), "solver": type(integrator).__name__}
+    request |= {SHOWN_IN: unit_of(job.model)}
     # Requests of earlier versions, with which a table may resume, lack these unless they were set.
     request |= {"max_steps": int(options.max_steps)} if options.max_steps != DEFAULT_MAX_STEPS else {}
     request |= {"errors": True} if options.errors else {}

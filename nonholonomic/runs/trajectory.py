@@ -23,7 +23,7 @@ from ..integration.problem import Status, run_bounds
 from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
-from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown
+from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown, unit_of
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stages_of
 from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
@@ -101,7 +101,7 @@ def explore(
 
     ```
     """
-    model, unit = model_of(system, start, None, input, jumps), unit or getattr(start, "shown_in", None)
+    model = model_of(system, start, None, input, jumps)
     return explore_model(drawn_by(model, draw), path, sliders, float(t1), unit, label)
 
 
@@ -124,7 +124,7 @@ def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: 
     require_unit(unit)
     model.check()
     live, stage = page_of(model, sliders, t1)
-    (stage,) = curves_in([stage], unit)
+    (stage,) = curves_in([stage], unit or unit_of(model))
     html_page = live_page(live if label is None else live._replace(title=label), stage)
     if path is not None:
         html_page.save(path)
@@ -433,7 +433,7 @@ class AbstractRun(Tabular, eqx.Module):
         """
         require_one_run(self, "explore", "")
         model, t1 = self.of_page
-        return explore_model(drawn_by(model, draw), path, sliders, t1, unit or self.unit, label)
+        return explore_model(drawn_by(model, draw), path, sliders, t1, unit, label)
 
     @status_line("reading off")
     def to_table(self) -> Table:

@@ -27,6 +27,9 @@ else:
 #: The name of the checksum of a user's equations in a request.
 EQUATIONS = "equations"
 
+#: The name of the units in which texts and pictures show a table, in a request and in the attributes.
+SHOWN_IN = "shown_in"
+
 #: Code and word for a cell that has not been computed.
 PENDING, UNREACHED = -1, "pending"
 
@@ -99,9 +102,12 @@ class Layout(NamedTuple):
         return cells * sum(sizes.values())
 
 
-def attributes_of(request: str, axes: list[str]) -> dict[str, str]:
-    """The attributes of a table: what was computed, in JSON, over which axes, and with which versions."""
-    return {"request": request, "axes": json.dumps(axes), "versions": json.dumps(versions())}
+def attributes_of(request: dict[str, object], axes: list[str], default: Any = None) -> dict[str, str]:
+    """The attributes of a table: what was computed, in JSON, over which axes, and with which versions; and in which units it
+    is shown, which is no part of what was computed. **Arguments:** `default`: as for `json.dumps`."""
+    words = json.dumps({name: value for name, value in request.items() if name != SHOWN_IN}, default=default)
+    unit = {SHOWN_IN: json.dumps(request[SHOWN_IN])} if request.get(SHOWN_IN) else {}
+    return {"request": words, "axes": json.dumps(axes), "versions": json.dumps(versions())} | unit
 
 
 def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:

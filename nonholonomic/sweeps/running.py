@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import itertools
-import json
 import multiprocessing
 import os
 import pickle
@@ -330,7 +329,7 @@ def layout_of(
     units = {name: part.unit for name, part in described.items() if name not in without_unit}
     request = request | {"float": str(np.dtype(jnp.result_type(float)))}
     # Without `default`: the text of an object would not tell two requests apart.
-    attributes = attributes_of(json.dumps(request), [axis.name for axis in axes])
+    attributes = attributes_of(request, [axis.name for axis in axes])
     long_names = {name: part.long_name for name, part in described.items() if part.long_name}
     kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
     dims = {name: tuple(variable.inner) for name, variable in variables.items() if variable.inner}

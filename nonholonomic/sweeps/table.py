@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Int
 
 from ..terminal import status_line
-from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html
+from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html, unit_of
 from ..validation import as_path, replacing, require_package
 from ..views.pages import Viewable, require_labels, require_others
 from ..views.plot import draw_curves, draw_portrait, draw_series, draw_table
 from ..views.stage import curves_in
 from ._store import Stored, contents_of, table_path, write_file
-from .grid import PENDING, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
+from .grid import PENDING, SHOWN_IN, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
 
 if TYPE_CHECKING:
     import pandas
@@ -95,6 +95,11 @@ class Table(eqx.Module):
 
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self]
+
+    @property
+    def unit(self) -> tuple[str, ...]:
+        """The units in which texts and pictures show the numbers: those of the launch, if it was stated in others."""
+        return tuple(json.loads(self.attributes.get(SHOWN_IN, "[]")))
 
     def label(self, name: str) -> str:
         """The label of a coordinate or variable for plots: its long name with its unit, "inversion time [s]"."""
@@ -293,7 +298,7 @@ class Table(eqx.Module):
         if not isinstance(at, dict | None):
             raise ValueError(f"at = {shown(at)} must be a dictionary, name of an axis -> its value")
         require_unit(unit)
-        if unit is not None:
+        if unit := unit or self.unit:
             at = {name: value * in_unit(self.units.get(name, "1"), unit)[1] for name, value in (at or {}).items()}
         return draw_table(self.drawn_in(unit, variable), variable, at, log, ax, x, y, label)
 
@@ -303,16 +308,16 @@ class Table(eqx.Module):
         **Arguments:** `unit`: as for `plot`, checked; `names`: the variables, or `None` for the first.
         """
         chosen = [next(iter(self.variables)) if name is None else str(name).partition(".")[0] for name in names]
-        if unit is None or not all(name in self.variables for name in chosen):
+        if not unit or not all(name in self.variables for name in chosen):
             return self
         kept = [*dict.fromkeys(chosen), *self.coords]
-        require_unit_of(unit, {name: self.units.get(name, "1") for name in kept})
+        if unit != self.unit:
+            require_unit_of(unit, {name: self.units.get(name, "1") for name in kept})
         units = {name: in_unit(si, unit) for name, si in self.units.items()}
 
         def converted(values: Mapping[str, Values], names: Sequence[str]) -> dict[str, Values]:
-            numbers = {name: values[name] for name in names if name in values}
-            factors = {name: units[name][1] for name in numbers if name in units}
-            return {name: array * factors[name] if name in factors else array for name, array in numbers.items()}
+            factors = {name: units.get(name, ("", 1.0))[1] for name in names if name in values}
+            return {name: values[name] if factor == 1.0 else values[name] * factor for name, factor in factors.items()}
 
         return dataclasses.replace(
             self,
@@ -322,32 +327,32 @@ class Table(eqx.Module):
         )
 
     @property
-    def _title(self) -> str:
+    def _summaries(self) -> tuple[str, list[tuple[str, str, str]]]:
+        """The axes; and a summary of each variable: its name with its dimensions, its range, and its long name."""
         axes = ", ".join(f"{name} ({len(self.coords[name])})" for name in axes_of(self.coords, self.inner))
-        return f"Table over {axes or 'one cell'}"
-
-    @property
-    def _rows(self) -> list[tuple[str, str, str]]:
-        """A summary of each variable: its name with its dimensions, its range, and its long name."""
+        title = f"Table over {axes or 'one cell'}"
         if isinstance(self.variables, Stored):
             place = f"in {self.variables.path}"
-            return [(name, place, self.long_names.get(name, "")) for name in self.variables]
+            return title, [(name, place, self.long_names.get(name, "")) for name in self.variables]
         # Cells that have not been computed appear only in the status.
         computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
-        rows = []
-        for name, values in self.variables.items():
-            unit = readable_unit(self.units.get(name, "1"))
+        rows, shown_table = [], self.drawn_in(self.unit, *self.variables)
+        for name, values in shown_table.variables.items():
+            unit = readable_unit(shown_table.units.get(name, "1"))
             dims = "".join(f" x {dim} ({len(self.coords[dim])})" for dim in self.inner.get(name, ()))
             summary = _summary(values if name == "status" else values[computed])
             rows.append((f"{name}{f' [{unit}]' if unit else ''}{dims}", summary, self.long_names.get(name, "")))
-        return rows
+        return title, rows
 
     def __repr__(self) -> str:
-        return "\n".join([self._title, *(f"  {name}: {summary}" for name, summary, _ in self._rows)])
+        title, rows = self._summaries
+        return "\n".join([title, *(f"  {name}: {summary}" for name, summary, _ in rows)])
 
     def _repr_html_(self) -> str:
-        axes = [(name, _summary(self.coords[name]), self.label(name)) for name in self.coords]
-        return as_html(self._title, [*axes, *self._rows])
+        shown_table = dataclasses.replace(self, variables={}).drawn_in(self.unit)
+        axes = [(name, _summary(values), shown_table.label(name)) for name, values in shown_table.coords.items()]
+        title, rows = self._summaries
+        return as_html(title, [*axes, *rows])
 
 
 def _summary(values: Values) -> str:
@@ -474,7 +479,7 @@ def run_table(
     long_names = {"time": "time"} | {name: quantity.long_name for name, quantity in quantities.items()}
     units = {"time": "s"} | {name: quantity.unit for name, quantity in quantities.items()}
     inner = {name: (quantity.components,) for name, quantity in quantities.items() if quantity.components is not None}
-    attributes = attributes_of(json.dumps(request, default=repr), axes)
+    attributes = attributes_of(request, axes, repr)
     return Table(coords, values, units, attributes, {}, inner, long_names)
 
 
@@ -573,7 +578,7 @@ class Tabular(Viewable):
                 quantities = tuple(first)
             else:
                 quantities, others = (), first
-        runs, unit = [self, *require_others(self, others)], unit or self.unit
+        runs, unit = [self, *require_others(self, others)], unit or unit_of(self)
         labels = self.labels_of(runs, unit) if label is None else require_labels(label, runs)
         title, labels = (labels[0], [""]) if label is None and len(runs) == 1 else ("", labels)
         if quantities:
@@ -606,7 +611,7 @@ class Tabular(Viewable):
         require_package("matplotlib", "plot", "portrait")
         require_unit(unit)
         x, y = x or self.portrait_axes[0], y or self.portrait_axes[1]
-        return draw_portrait(self.table_of((x, y)).drawn_in(unit or self.unit, x, y), x, y, ax)
+        return draw_portrait(self.table_of((x, y)).drawn_in(unit or unit_of(self), x, y), x, y, ax)
 
     def __getitem__(self, name: str) -> Any:
         """A quantity by its name, also inside transformations.

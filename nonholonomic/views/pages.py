@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from ..terminal import status_line
-from ..text import Unit, require_unit, shown
+from ..text import Unit, require_unit, shown, unit_of
 from ..validation import replacing, require, require_file, require_increasing, require_package
 from .stage import Arrow, Body, Curve, Draw, Marks, Mesh, Show, Stage, Trace, css, curves_in, finite
 
@@ -335,9 +335,6 @@ def stages_of(run: Any, runs: list[Any], overlaid: bool, unit: Unit) -> list[Sta
 class Viewable:
     """A run that can be drawn, alone or with others."""
 
-    #: The units in which pictures, pages and texts show the numbers of the run, unless others are asked for.
-    unit: ClassVar[Unit] = None
-
     #: What pictures and pages mark in the curves.
     marks: ClassVar[Marks] = ()
 
@@ -457,7 +454,7 @@ class Viewable:
     def _stages(self, others: Sequence[Any], overlaid: bool, unit: Unit, draw: Draw, label: Label) -> list[Stage]:
         """The stages in a unit, after a check of the unit and that the others are runs of the same package."""
         require_unit(unit)
-        runs, unit = [cast(Any, self), *require_others(self, others)], unit or self.unit
+        runs, unit = [cast(Any, self), *require_others(self, others)], unit or unit_of(self)
         runs = runs if draw is None else [run.drawn_by(draw) for run in runs]
         return curves_in(runs[0].stages(runs[1:], overlaid, unit, *([] if label is None else [label])), unit)
 

@@ -57,7 +57,7 @@ def test_launches_may_be_a_list_of_launches():
     at_once = tippe.Launch(LAUNCH.theta, LAUNCH.spin, [0.0] * 4, [0.0] * 4, velocity=([0, 0.1, 0, 0], [0, 0.2, 0, 0]))
     data = tippe.InversionTimes(launches, TIMES, 0.05, t1=6.0)
     assert eqx.tree_equal(data, tippe.InversionTimes(at_once, TIMES, 0.05, t1=6.0))
-    assert data.labels[0] == "theta 0.2, spin 110"
+    assert data.labels[0] == "theta 0.2 rad, spin 110 rad/s, velocity (0, 0) m/s"
     assert data.labels_in(("deg", "rpm"))[0] == "theta 11.46 deg, spin 1050 rpm, velocity (0, 0) m/s"
 
 

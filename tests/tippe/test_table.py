@@ -10,6 +10,7 @@ import pytest
 from close import assert_close
 from tops import rutstam_top
 
+import nonholonomic
 import tippe
 from nonholonomic.sweeps import running as sweeping
 
@@ -36,6 +37,28 @@ def test_axes_come_in_their_order_and_scalars_are_none(rutstam_scene_module):
     single = tippe.inversion_table(rutstam_scene_module, theta=0.1, spin=100.0, t1=0.1)
     assert single.shape == ()
     assert single.status == "not_inverted"
+
+
+def test_a_sweep_from_a_launch_in_degrees_is_shown_in_degrees(rutstam_scene_module, tmp_path):
+    """Its numbers stay in SI units."""
+    launch, theta = tippe.Launch.degrees(theta=6, rpm=1500), np.radians([6.0, 9.0, 12.0])
+    axes = {"launch.theta": theta, "mu": [0.2, 0.3]}
+    table = nonholonomic.sweep(rutstam_scene_module, launch, 0.1, axes=axes, path=tmp_path / "table.h5")
+    in_radians = nonholonomic.sweep(rutstam_scene_module, tippe.Launch(launch.theta, launch.spin), 0.1, axes=axes)
+    np.testing.assert_array_equal(table["launch.theta"], theta)
+    np.testing.assert_array_equal(table.end_theta, in_radians.end_theta)
+    low, high = np.degrees([table.end_theta.min(), table.end_theta.max()])
+    assert f"end_theta [deg]: {low:.6g} to {high:.6g}" in repr(table)
+    assert "end_theta [rad]" in repr(in_radians)
+    assert "6 to 12</td>" in table._repr_html_()
+    assert "θ(0) [deg]</td>" in table._repr_html_()
+    (panel,) = table.plot("end_theta").axes
+    assert (panel.get_xlabel(), panel.get_ylabel()) == ("θ(0) [deg]", "θ at the end of the run [deg]")
+    assert_close(panel.get_lines()[0].get_xdata(), [6.0, 9.0, 12.0], rtol=1e-14)
+    assert table.plot("end_theta", unit="rad").axes[0].get_xlabel() == "θ(0) [rad]"
+    # Where nothing that is drawn is an angle.
+    assert table.plot("steps", x="mu", at={"launch.theta": theta[1]}).axes[0].get_title() == "θ(0) = 9 deg"
+    assert repr(tippe.Table.load(tmp_path / "table.h5")) == repr(table)
 
 
 def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, rutstam_scene_module, tmp_path):

@@ -16,7 +16,7 @@ from nonholonomic.geometry.surface import as_surface
 from nonholonomic.geometry.vector import cross, dot, none_if_zero, scale, sum_vectors
 from nonholonomic.integration import Components, States
 from nonholonomic.parameters import as_one, numbers
-from nonholonomic.text import likely_fix, shown, suspected_gravity
+from nonholonomic.text import Stated, likely_fix, shown, suspected_gravity
 from nonholonomic.validation import Bound, Bounded, as_number, explaining, largest, require, require_all, require_kind
 
 from ..friction import A_LAW, AbstractFriction, Frictionless, NoSlip, SetValuedCoulomb, as_law
@@ -40,7 +40,7 @@ SPINS = "Launch takes spin in rad/s, Launch.degrees takes rpm: 20 turns a second
 IN_DEGREES = ("deg", "rpm", "s")
 
 
-class Launch(Bounded):
+class Launch(Stated, Bounded):
     """A launch: position on the arena, inclination, spin and velocity of the top.
 
     The axis is e = cos(theta) n + sin(theta) (cos(azimuth) t1 + sin(azimuth) t2), with n the arena's normal towards the
@@ -80,10 +80,6 @@ class Launch(Bounded):
     units: ClassVar[dict[str, str]] = {"theta": "rad", "spin": "rad s-1", "eta": "rad", "azimuth": "rad"}
     units |= {"place": "m or rad", "velocity": "m s-1", "angular_velocity": "rad s-1"}
     advice: ClassVar[dict[str, str]] = dict.fromkeys(("spin", "rpm"), SPINS)
-
-    #: The units in which texts, pictures and pages of a launch and its runs show numbers, if it was stated in them. Not a
-    #: field: neither the programs nor the gradients of a launch have units.
-    __slots__ = ("shown_in",)
 
     theta: Float[Array, "..."] = eqx.field(converter=as_number, metadata=INCLINATION)
     spin: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -134,13 +130,7 @@ class Launch(Bounded):
         require(azimuth, "azimuth", why="in degrees")
         require(rpm, "rpm")
         theta, eta, azimuth = (jnp.radians(as_number(angle)) for angle in (theta, eta, azimuth))
-        launch = cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others)
-        object.__setattr__(launch, "shown_in", IN_DEGREES)
-        return launch
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Copies are shown in SI units: pickle could not set the attribute of a frozen module.
-        return dict(vars(self))
+        return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others).stated_in(IN_DEGREES)
 
     def suspicion(self) -> str | None:
         fastest = largest(self.spin)

@@ -20,7 +20,7 @@ from nonholonomic.parameters import description
 from nonholonomic.runs.model import AbstractModel, Number, model_of
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
-from nonholonomic.text import Unit, distinguishing_labels, in_unit
+from nonholonomic.text import Unit, distinguishing_labels, in_unit, unit_of
 from nonholonomic.validation import ArrayOrList, is_traced, require_one_run, times_within
 from nonholonomic.views import Marks
 
@@ -289,10 +289,6 @@ class AbstractTrajectory(AbstractRun):
         return model_of(self.scene, self.launch), float(self.end_time)
 
     @property
-    def unit(self) -> Unit:
-        return getattr(self.launch, "shown_in", None)
-
-    @property
     def codes(self) -> Int[Array, "..."] | str | None:
         return self.status
 
@@ -304,7 +300,7 @@ class AbstractTrajectory(AbstractRun):
         values = {name: np.asarray(quantity.of(name, self)) for name, quantity in quantities.items()}
         request = description("scene", self.scene)
         request |= {} if self.launch is None else description("launch", self.launch)
-        request |= {"status": str(self.status), "end_time": float(self.end_time)}
+        request |= {"status": str(self.status), "end_time": float(self.end_time), "shown_in": unit_of(self)}
         return run_table(quantities, coords, values, ["time"], request)
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
@@ -367,7 +363,7 @@ class AbstractTrajectory(AbstractRun):
 
     def in_words(self) -> str:
         word = self.status if isinstance(self.status, str) else Status(int(self.status)).word
-        angle, factor = in_unit("rad", self.unit)
+        angle, factor = in_unit("rad", unit_of(self))
         lines = [
             f"Trajectory of {len(self.t)} times, {word} at {float(self.end_time):.6g} s",
             f"  theta: {factor * float(self.theta[0]):.6g} to {factor * float(self.theta[-1]):.6g} {angle}",

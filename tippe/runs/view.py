@@ -267,8 +267,7 @@ def explore(
     ```
     """
     check_run(scene, launch, t1, TOLERANCE)
-    model, unit = TopModel(scene=scene, launch=launch), unit or getattr(launch, "shown_in", None)
-    return explore_model(model, path, sliders, float(t1), unit, label)
+    return explore_model(TopModel(scene=scene, launch=launch), path, sliders, float(t1), unit, label)
 
 
 @page_of.register(TopModel)
