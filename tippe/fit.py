@@ -335,6 +335,7 @@ def read_inversion_times(
                 "launch=tippe.Launch(theta=0.1, spin=150.0)"
             )
     launches = Launch(**table.numbers) if launch is None else dataclasses.replace(launch, **table.numbers)
+    launches = launches.stated_in((*table.unit, *unit_of(launch)))
     return InversionTimes(launches, table.time, table.error, t1, until=limits, angle=angle, student=student)
 
 
@@ -463,4 +464,4 @@ def read_recording(
     [0.   0.04] [0.0995 0.11  ]
     """
     table = read_columns(path, columns, fps, error, QUANTITIES, decimal)
-    return Recording(launch, *table, t0, student)
+    return Recording(launch, *table[:-1], t0, student).stated_in(table.unit)

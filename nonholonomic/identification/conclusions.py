@@ -398,16 +398,17 @@ BESIDE = 3.0
 class Minimum(NamedTuple):
     """A minimum that the data allow.
 
-    - `estimates`: name -> value at its most likely point; `weight`: its probability; `deviance`: -2 log likelihood.
+    - `estimates`: name -> value at its most likely point; `weight`: its probability; `deviance`: -2 log likelihood; `text`: the
+      values in the units that are shown.
     """
 
     estimates: dict[str, float]
     weight: float
     deviance: float
+    text: str
 
     def __str__(self) -> str:
-        values = ", ".join(f"{name} {value:.4g}" for name, value in self.estimates.items())
-        return f"{values} (weight {self.weight:.2f})"
+        return f"{self.text} (weight {self.weight:.2f})"
 
 
 def minima_of(explorer: Explorer, sample: Pool) -> tuple[Minimum, ...]:
@@ -437,7 +438,8 @@ def minima_of(explorer: Explorer, sample: Pool) -> tuple[Minimum, ...]:
         best = np.flatnonzero(groups == group)[np.argmax(sample.log_density[used][groups == group])]
         values = dict(zip(problem.names, np.asarray(problem.unknowns.values(points[best])).tolist(), strict=True))
         deviance = float(-2.0 * np.sum(sample.groups[used][best]))
-        minima.append(Minimum(values, float(np.sum(weights[groups == group])), deviance))
+        text = ", ".join(f"{name} {explorer.density.written(name, value)}" for name, value in values.items())
+        minima.append(Minimum(values, float(np.sum(weights[groups == group])), deviance, text))
     return tuple(sorted((minimum for minimum in minima if minimum.weight > LEAST_WEIGHT), key=lambda m: -m.weight))
 
 
@@ -470,7 +472,7 @@ def without_prediction(explorer: Explorer, sample: Pool, distribution: Distribut
         return "", 0.0
     values = np.asarray(problem.unknowns.values(points[failed]))
     ends = zip(problem.names, np.min(values, axis=0), np.max(values, axis=0), strict=True)
-    places = ", ".join(f"{name} {low:.4g}" + (f" to {high:.4g}" if high > low else "") for name, low, high in ends)
+    places = ", ".join(f"{name} {explorer.density.written(name, low, high)}" for name, low, high in ends)
     words = (
         f"{np.sum(failed)} of {len(failed)} candidates count as impossible, because a run failed, was unresolved, ended too "
         f"early or was illegal: at {places}"
@@ -498,7 +500,7 @@ def remarks(
         low, high = quantiles(values[:, k], weights, np.array([0.025, 0.975]))
         for bound in (problem.unknowns.lower[k], problem.unknowns.upper[k]):
             if np.isfinite(bound) and np.sum(weights[np.abs(values[:, k] - bound) < NEAR * (high - low)]) > CUT:
-                concerns.append(f"the bound {float(bound):g} cuts the interval of {name}")
+                concerns.append(f"the bound {explorer.density.written(name, float(bound))} cuts the interval of {name}")
         low, high = distribution.interval(k, 1.96)
         sides = high - distribution.estimate[k], distribution.estimate[k] - low
         if max(sides) > SKEWED * max(min(sides), 1e-300):

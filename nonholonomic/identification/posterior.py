@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..sweeps.running import workers
 from ..terminal import status_line
-from ..text import shown
+from ..text import in_unit, readable_unit, shown
 from ..validation import ArrayOrList, is_traced, require
 
 # Compare predictions with measurements: residuals whose squares add up to -2 log likelihood.
@@ -623,7 +623,8 @@ class LogDensity(eqx.Module):
 
     - `names`: names of the unknowns, in the order of the coordinates; `start`: (unknowns,), coordinates at which to
       start.
-    - `units`: name of an unknown -> its unit, if known.
+    - `units`: name of an unknown -> its unit, if known; `unit`: the units in which texts and pictures show the unknowns.
+    - `series_units`: the unit of each series of the measurements, if known; `series_shown`: the unit that is shown.
 
     **Example:** that of the subpackage's example.
 
@@ -635,6 +636,9 @@ class LogDensity(eqx.Module):
     measurements: Measurements
     open_series: tuple[int, ...] = eqx.field(static=True)
     series_units: tuple[str, ...] = eqx.field(static=True, default=())
+    series_shown: tuple[str, ...] = eqx.field(static=True, default=())
+    own_units: tuple[str, ...] = eqx.field(static=True, default=())
+    unit: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __repr__(self) -> str:
         return f"LogDensity of {', '.join(self.names)}, given {self.measurements.value.size} measurements"
@@ -680,9 +684,15 @@ class LogDensity(eqx.Module):
 
     @property
     def units(self) -> dict[str, str]:
-        """The units of the unknown errors, if known."""
-        units = {k: self.series_units[k] for k in self.open_series if k < len(self.series_units)}
-        return {f"error[{k}]": unit for k, unit in units.items()}
+        """The units of the unknowns, if known."""
+        errors = {f"error[{k}]": self.series_units[k] for k in self.open_series if k < len(self.series_units)}
+        return dict(zip(self.problem.names, self.own_units, strict=False)) | errors
+
+    def written(self, name: str, *values: float, form: str = ".4g") -> str:
+        """The value of an unknown, or a range, as text in the unit that is shown."""
+        unit, factor = in_unit(self.units.get(name, "1"), self.unit)
+        texts = dict.fromkeys(f"{factor * value:{form}}" for value in values)
+        return f"{' to '.join(texts)} {readable_unit(unit)}".rstrip()
 
     @property
     def start(self) -> Float[Array, " unknowns"]:

@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..text import SYNONYMS, UNITS, counted, likely, one_line, readable_unit, shown
+from ..text import SYNONYMS, UNITS, Stated, counted, likely, one_line, readable_unit, shown
 from ..validation import as_number, as_path, require, warn
 from .posterior import Measurements
 
@@ -93,7 +93,7 @@ def as_quantity(words: object) -> Any:
     return tuple(words) if isinstance(words, list) else words
 
 
-class AbstractData(eqx.Module):
+class AbstractData(Stated):
     """A set of data of a fit.
 
     In a fit of runs, it has a method `model(system)` that returns the checked model of the runs; the numbers of its start have
@@ -382,6 +382,12 @@ class TextTable(NamedTuple):
             )
         return columns
 
+    @property
+    def unit(self) -> tuple[str, ...]:
+        """The units of the columns, as far as they have a name."""
+        sizes = ((UNITS[self.units[name]], self.parts(name)[1]) for name in self.columns)
+        return tuple(unit for known, size in sizes for unit in known if known[unit] == size)
+
     def numbers(self, name: str, remark: str = "", infinite: bool = False, error: Columns = None) -> np.ndarray:
         """A column in SI units, NaN where it is missing.
 
@@ -494,8 +500,8 @@ def _split(header: str) -> tuple[str, str]:
 
 
 class Read(NamedTuple):
-    """The contents of a file: times [s]; samples in SI units, NaN where missing; their errors or `None`; and the
-    quantity.
+    """The contents of a file: times [s]; samples in SI units, NaN where missing; their errors or `None`; the quantity; and the
+    units of the file.
 
     A single column is given by its name, and its samples are (times,).
     """
@@ -504,6 +510,7 @@ class Read(NamedTuple):
     value: Float[np.ndarray, "times *columns"]
     error: Float[np.ndarray, "times *columns"] | None
     quantity: str | tuple[str, ...]
+    unit: tuple[str, ...]
 
 
 def read_columns(
@@ -524,7 +531,7 @@ def read_columns(
     - `quantities`: the quantities that can be recorded.
     - `decimal`: "," for a file with decimal commas, whose columns are not separated by commas.
 
-    **Returns:** times, values, errors and quantity.
+    **Returns:** times, values, errors, quantity and units.
 
     **Raises:** `ValueError` that names the file, the column and the problem.
 
@@ -579,8 +586,8 @@ def read_columns(
             raise ValueError(f"error = {shown(error)} must be {{{form}}}, or None")
         errors = np.stack([file.numbers(name, error=error) for name in names], axis=1)[mask]
     if len(names) == 1:
-        return Read(times[mask], value[mask, 0], None if errors is None else errors[:, 0], names[0])
-    return Read(times[mask], value[mask], errors, names)
+        return Read(times[mask], value[mask, 0], None if errors is None else errors[:, 0], names[0], file.unit)
+    return Read(times[mask], value[mask], errors, names, file.unit)
 
 
 class ReadLaunches(NamedTuple):
@@ -590,7 +597,7 @@ class ReadLaunches(NamedTuple):
     - `time`: (launches,), infinite where the event did not happen; `until`: (launches,), the time until which it did
       not happen, NaN where the file does not state one.
     - `error`: a standard error for all, or (launches,).
-    - `lines`: the number of each launch's line in the file.
+    - `lines`: the number of each launch's line in the file; `unit`: the units of the file.
     """
 
     numbers: dict[str, Float[np.ndarray, " launches"]]
@@ -598,6 +605,7 @@ class ReadLaunches(NamedTuple):
     until: Float[np.ndarray, " launches"]
     error: Float[np.ndarray, "*launches"]
     lines: tuple[int, ...]
+    unit: tuple[str, ...]
 
 
 def read_launches(
@@ -661,6 +669,7 @@ def read_launches(
         until[mask],
         errors[mask] if errors.ndim else errors,
         tuple(line for line, is_whole in zip(file.lines, mask, strict=True) if is_whole),
+        file.unit,
     )
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..parameters import ByName, full_name
 from ..terminal import status_line
-from ..text import counted, readable_unit, require_unit, shown, text_as_html
+from ..text import Unit, counted, in_unit, readable_unit, require_unit, shown, text_as_html
 from ..validation import require, require_flag, require_package, require_scalars, require_whole, warn
 from ..views import draw_fit
 from .conclusions import Distribution, Profile, Verdict, judge, profiled, sentences
@@ -94,7 +94,7 @@ class Identification:
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
     - `distribution`: the `Distribution` of the coordinates, with its weighted points.
     - `density`: the `LogDensity` of model and measurements; `density.series_units`: the unit of each series, if known.
-    - `units`: name -> unit of a parameter, if known.
+    - `units`: name -> unit of a parameter, if known. Texts and pictures show the units of the launch and of the data.
 
     **Example:** the fit of the subpackage's example.
 
@@ -219,7 +219,8 @@ class Identification:
         """Data and model, residuals, the distributions of up to six parameters with estimates and 95 % intervals, and the
         correlations (needs matplotlib).
 
-        **Arguments:** `unit`: unit to draw in, such as "deg" for all angles, or several, such as ("deg", "rpm").
+        **Arguments:** `unit`: unit to draw in, such as "deg" for all angles, or several, such as ("deg", "rpm"); by default
+        those of the launch and of the data.
 
         **Returns:** a matplotlib figure.
 
@@ -228,12 +229,23 @@ class Identification:
         require_package("matplotlib", "plot", "plot")
         require_unit(unit)
         sources = getattr(self.density.problem.model, "recorded", ())
-        labels = [source.labels_in(unit) for source in sources] or [[row.label for row in self.residuals]]
+        labels = [source.labels_in(unit or self.density.unit) for source in sources]
+        labels = labels or [[row.label for row in self.residuals]]
         return draw_fit(self, numbered(labels), unit)
 
     def _place(self, name: str) -> int:
         valid = list(self.estimates)
         return valid.index(full_name("name", name, valid))
+
+    def rows_in(self, unit: Unit = None) -> list[tuple[ResidualRow, str, float]]:
+        """The residuals in the unit that is shown, this unit, and the factor that converts to it. **Arguments:** `unit`: as for
+        `plot`."""
+        rows, units = [], dict(enumerate(self.density.series_units))
+        for row, number in zip(self.residuals, np.asarray(self.density.measurements.series).tolist(), strict=True):
+            text, factor = in_unit(units.get(number, "1"), unit or self.density.series_shown[number : number + 1])
+            numbers = {name: factor * getattr(row, name) for name in ("value", "error", "prediction", "upper")}
+            rows.append((row._replace(**numbers), text, factor))
+        return rows
 
     _repr_html_ = text_as_html
 
@@ -245,14 +257,14 @@ class Identification:
         ]
         width = max(map(len, self.estimates))
         for name in self.estimates:
-            estimate, low, high = self.rounded(name)
-            unit = readable_unit(self.units.get(name, "1"))
+            unit, factor = in_unit(self.units.get(name, "1"), self.density.unit)
+            estimate, low, high = self.rounded(name, factor)
             interval = "undetermined" if np.isinf(self.standard_errors[name]) else "no interval"
             if np.isfinite(self.standard_errors[name]):
                 likely = self.most_likely[name]
                 differs = abs(likely - self.estimates[name]) > NOTICEABLE * self.standard_errors[name]
-                interval = f"95 %: {low} to {high}" + differs * f"; most likely {likely:.4g}"
-            lines.append(f"  {name:{width}}  {' '.join(filter(None, (estimate, unit)))}  ({interval})")
+                interval = f"95 %: {low} to {high}" + differs * f"; most likely {factor * likely:.4g}"
+            lines.append(f"  {name:{width}}  {f'{estimate} {readable_unit(unit)}'.rstrip()}  ({interval})")
         return "\n".join([*lines, f"verdict: {self.verdict}", "the statistics: print(fit.details)"])
 
     def rounded(self, name: str, factor: float = 1.0) -> tuple[str, str, str]:
@@ -291,17 +303,19 @@ class Identification:
         ]
         width = max(map(len, self.estimates))
         for name, value in self.estimates.items():
-            lines.append(
-                f"  {name:{width}}  {value:.6g} +- {self.standard_errors[name]:.2g}, {self.most_likely[name]:.6g}"
-            )
+            _, factor = in_unit(self.units.get(name, "1"), self.density.unit)
+            error, likely = factor * self.standard_errors[name], self.most_likely[name]
+            written = self.density.written(name, likely, form=".6g")
+            lines.append(f"  {name:{width}}  {factor * value:.6g} +- {error:.2g}, {written}")
         lines.append("combinations of parameters and their relative errors")
         for value, words in zip(self.identifiability.singular_values, self.identifiability.words, strict=True):
             mark = "  UNDETERMINED" if words in self.identifiability.unseen else ""
             lines.append(f"  {1.0 / max(value, 1e-300):8.2g}  {words}{mark}")
         lines.append("measured, predicted at the most likely values, residual in standard errors")
         width = max(len(row.label) for row in self.residuals)
-        for row in self.residuals[:MOST_ROWS]:
-            lines.append(f"  {row.label:{width}}  {row.measured:20}  {row.prediction:.6g}  {row.residual:+.2f}")
+        for row, unit, _ in self.rows_in()[:MOST_ROWS]:
+            predicted = f"{row.prediction:.6g} {readable_unit(unit)}".rstrip()
+            lines.append(f"  {row.label:{width}}  {row.measured:20}  {predicted}  {row.residual:+.2f}")
         if len(self.residuals) > MOST_ROWS:
             largest = max(self.residuals, key=lambda row: abs(row.residual))
             lines.append(
@@ -325,7 +339,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
     likely, covariance = problem.unknowns.values(optimum), distribution.covariance_of_values(problem, slopes)
     numbers = (measurements.value, measurements.error, linearised.prediction[best], linearised.residual[best, :count])
     table = zip(labels, *(np.asarray(part).tolist() for part in (*numbers, measurements.upper)), strict=True)
-    combinations = identifiability(problem, likely, slopes, linearised.information[best, :count])
+    combinations = identifiability(ends.density, likely, slopes, linearised.information[best, :count])
     # Where the weights hold, a search by slopes that got stuck on a stair, or ended early, does not matter.
     status = "converged" if distribution.kind in ("weights", "linear") else statuses[best]
     with np.errstate(invalid="ignore"):
@@ -354,6 +368,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         coordinate_covariance=distribution.covariance,
         distribution=distribution,
         density=ends.density,
+        units={name: unit for name, unit in ends.density.units.items() if name in problem.names},
     )
 
 
@@ -473,7 +488,7 @@ class Draws(NamedTuple):
     - `values`: name -> (chains, draws), where the end of a name is enough; `coordinates`: (chains, draws, unknowns).
     - `r_hat`, `ess`: name -> number: the potential scale reduction, which should be below 1.01, and the effective number of
       independent draws.
-    - `units`: name -> unit, of the unknown errors.
+    - `units`: name -> unit, if known.
     - `accepted`: fraction of accepted proposals; `runs`: number of parameter sets for which the model ran.
     - `flaws`: why the draws are not from the posterior, in words; empty if they are, as `good` says. `concerns`: what else to
       check.

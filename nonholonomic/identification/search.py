@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 from ..terminal import Progress
 from ..validation import warn
 from .exploration import FALL, Explorer, Mixture, Pool
-from .posterior import Linearised, LogDensity, Problem, deviances, estimated_errors, linearise, predictions, weighed
+from .posterior import Linearised, LogDensity, deviances, estimated_errors, linearise, predictions, weighed
 from .recording import AbstractRecording
 
 #: Damping of the first step, as a fraction of the squared slope with respect to each coordinate.
@@ -188,7 +188,7 @@ def _singular(slopes: Float[np.ndarray, "n unknowns"]) -> tuple[np.ndarray, np.n
 
 
 def identifiability(
-    problem: Problem,
+    density: LogDensity,
     estimates: Float[np.ndarray, " unknowns"],
     slopes: Float[np.ndarray, " unknowns"],
     jacobian: Float[np.ndarray, "n unknowns"],
@@ -200,6 +200,7 @@ def identifiability(
     `jacobian`: (n, unknowns), of the residuals with respect to the coordinates.
     """
     # Changes of a parameter that cannot be negative are relative, in per cent; others in hundredths of its unit.
+    problem = density.problem
     positive, units = np.asarray(problem.unknowns.lower >= 0.0), np.asarray(problem.unknowns.unit)
     values, directions = _singular(
         jacobian * np.where(positive, np.abs(estimates), units) / np.where(slopes == 0.0, 1.0, slopes)
@@ -208,7 +209,7 @@ def identifiability(
     for direction in directions:
         shares = direction / direction[np.argmax(np.abs(direction))]
         parts = [
-            f"{name} {share:+.2g} %" if is_positive else f"{name} {0.01 * share * unit:+.2g}"
+            f"{name} " + (f"{share:+.2g} %" if is_positive else density.written(name, 0.01 * share * unit, form="+.2g"))
             for name, share, is_positive, unit in zip(problem.names, shares, positive, units, strict=True)
             if abs(share) >= LEAST_SHARE
         ]

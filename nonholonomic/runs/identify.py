@@ -22,7 +22,7 @@ from ..integration import Settings
 from ..integration.problem import MOST_STEPS, tolerance_bound
 from ..parameters import full_name, require_apart
 from ..terminal import status_line
-from ..text import likely, shown
+from ..text import in_unit, likely, shown, unit_of
 from ..validation import as_number, nan_unless, require
 from .event import SILENT, time_of_event
 from .model import AbstractModel, check_run, model_of, require_event
@@ -550,11 +550,7 @@ def fit_runs(
     with status_line("fitting", search["progress"]):
         density = posterior_of_runs(system, data, free, None, expected, tolerance, slopes)
         sources = density.problem.model.data
-        fit = most_likely(density, numbered([source.data.labels for source in sources]), **search)
-    own = {name: own_name(name) for name in density.problem.names}
-    label = sources[0].model.label
-    units = {name: "s" if short == "t0" else label([short])[short][1] for name, short in own.items()}
-    return dataclasses.replace(fit, units=units)
+        return most_likely(density, numbered([source.data.labels for source in sources]), **search)
 
 
 def posterior_of_runs(
@@ -596,14 +592,21 @@ def posterior_of_runs(
             "deviation, or a function"
         )
     by_name = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
-    parts, units = [], []
+    parts, units, series_shown = [], [], []
     for source in sources:
         part = source.data.measurements
         # The series are renumbered consecutively.
         parts.append(eqx.tree_at(lambda part: part.series, part, part.series + len(units)))
-        units += source.data.units_of(source.model)[: int(np.max(part.series)) + 1]
+        own = source.data.units_of(source.model)[: int(np.max(part.series)) + 1]
+        units += own
+        series_shown += [in_unit(si, unit_of(source.data))[0] for si in own]
     measurements = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    return LogDensity.of(model, measurements, unknowns, by_name, tuple(units), slopes or model.slopes(unknowns))
+    density = LogDensity.of(model, measurements, unknowns, by_name, tuple(units), slopes or model.slopes(unknowns))
+    label, shorts = sources[0].model.label, map(own_name, unknowns)
+    own_units = tuple("s" if short == "t0" else label([short])[short][1] for short in shorts)
+    # Recorded degrees are no reason to show a spin in degrees per second.
+    unit = (*unit_of(*(data.launch for data in several), *several), "rad/s")
+    return dataclasses.replace(density, series_shown=tuple(series_shown), own_units=own_units, unit=unit)
 
 
 def of_data(parameters: dict[str, Value], k: int) -> dict[str, Value]:

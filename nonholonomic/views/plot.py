@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..parameters import meant, short_names
-from ..text import Unit, in_unit, likely, readable_unit, shown
+from ..text import UNITS, Unit, in_unit, likely, readable_unit, shown
 from ..validation import require
 from .stage import Marks, Stage, css
 
@@ -431,17 +431,16 @@ class _Drawn(NamedTuple):
 
     @classmethod
     def of(cls, fit: "Identification", unit: Unit) -> "_Drawn":
-        numbers, names = np.asarray(fit.density.measurements.series), []
-        series, factors = [np.flatnonzero(numbers == number) for number in np.unique(numbers)], np.ones(len(numbers))
-        for k, indices in enumerate(series):
-            label = fit.residuals[indices[0]].label
-            si = fit.density.series_units[k] if k < len(fit.density.series_units) else "1"
-            quantity = label.partition("(")[0] if "(" in label else "time" if si == "s" else "measured"
-            shown, factors[indices] = in_unit(si, unit)
+        numbers = np.asarray(fit.density.measurements.series)
+        series, names = [np.flatnonzero(numbers == number) for number in np.unique(numbers)], []
+        rows, shown_units, factors = zip(*fit.rows_in(unit), strict=True)
+        factors = np.array(factors)
+        for indices in series:
+            label, shown = rows[indices[0]].label, shown_units[indices[0]]
+            quantity = label.partition("(")[0] if "(" in label else "time" if shown in UNITS["s"] else "measured"
             names.append(_with_unit(quantity, shown))
         value, upper, errors, predicted = (
-            factors * np.array([getattr(row, name) for row in fit.residuals])
-            for name in ("value", "upper", "error", "prediction")
+            np.array([getattr(row, name) for row in rows]) for name in ("value", "upper", "error", "prediction")
         )
         is_limit = np.array([row.censored for row in fit.residuals])
         # Draw an angle on the same turn as its prediction.
@@ -590,7 +589,7 @@ def _draw_limits(axes: "Axes", places: np.ndarray, lower: np.ndarray, upper: np.
 def _draw_distribution(fit: "Identification", name: str, axes: "Axes", unit: Unit) -> None:
     """The probability of the values of one parameter: of a linear model a normal distribution, otherwise that of the weighted
     points of the exploration."""
-    shown, factor = in_unit(fit.units.get(name, "1"), unit)
+    shown, factor = in_unit(fit.units.get(name, "1"), unit or fit.density.unit)
     estimate, low, high = fit.rounded(name, factor)
     distribution = fit.distribution
     if distribution.kind == "weights":

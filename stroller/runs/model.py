@@ -567,4 +567,5 @@ def read_recording(
     [0. 1. 2.] [1.5  1.39 1.31]
     """
     table = identification.read_columns(path, columns, fps, error, RECORDED, decimal)
-    return Recording(launch, *table, input=input, t0=t0, student=student, jumps=jumps)
+    recording = Recording(launch, *table[:-1], input=input, t0=t0, student=student, jumps=jumps)
+    return recording.stated_in(table.unit)

@@ -43,6 +43,7 @@ def test_the_file_of_a_class_becomes_launches_and_times(tmp_path, cell, options,
     np.testing.assert_allclose(data.launch.theta, np.radians([4.0, 5.5, 4.0]))
     np.testing.assert_allclose(data.launch.spin, np.array([1100.0, 1400.0, 600.0]) * math.pi / 30.0)
     np.testing.assert_allclose(data.time, [3.47, 3.49, np.inf])
+    assert data.labels[1] == "theta 5.5 deg, spin 1400 rpm"
     assert (float(data.error), float(data.t1)) == (0.05, 30.0)
     assert (data.until is None) == (until is None)
     np.testing.assert_allclose(data.until or [] if until is None else data.until, until or [])

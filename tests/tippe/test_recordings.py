@@ -5,6 +5,7 @@ import math
 import jax
 import numpy as np
 import pytest
+from close import assert_close
 from tops import rutstam_top
 from viscous_top import Body, azimuth, follow, start, theta
 
@@ -56,11 +57,14 @@ def fit(tmp_path_factory, rutstam_scene):
     return tippe.identify(rutstam_scene, [first, second], free)
 
 
-def test_friction_from_a_film(rutstam_scene):
-    """The short form of the two films: theta alone, a sample missing, by a clock that is not known."""
+def test_friction_from_a_film(rutstam_scene, tmp_path):
+    """The short form of the two films: theta alone, in degrees, a sample missing, by a clock that is not known."""
     clock, value = film(0)
     value[5, 0] = np.nan
-    recording = tippe.Recording(tippe.Launch(0.4, 100.0), clock, value[:, 0], NOISE)
+    cells = [f"{t:.15g},{math.degrees(angle):.15g}" for t, (angle, _) in zip(clock, value, strict=True)]
+    (tmp_path / "film.csv").write_text("time [s],theta [deg]\n" + "\n".join(cells))
+    error = {"theta": (math.degrees(NOISE), "deg")}
+    recording = tippe.read_recording(tmp_path / "film.csv", launch=tippe.Launch(0.4, 100.0), error=error)
     fit = tippe.identify(rutstam_scene, recording, {"mu": 0.2, "data[0].t0": 0.01}, tolerance=1e-6, progress=False)
     assert fit.status == "converged"
     assert len(fit.residuals) == len(clock) - 1
@@ -68,6 +72,16 @@ def test_friction_from_a_film(rutstam_scene):
     for name, exact in {"scene.friction.mu": MU, "data[0].t0": LAUNCHES["t0"][0]}.items():
         assert abs(fit.estimates[name] - exact) < 4.0 * fit.standard_errors[name], name
     assert fit.standard_errors["scene.friction.mu"] < 0.05
+    # Texts and pictures are in the unit of the file; the numbers are in SI units.
+    assert_close([row.value for row in fit.residuals[:5]], value[:5, 0], rtol=1e-12)
+    first = fit.residuals[0]
+    measured = f"{math.degrees(first.value):.6g} +- {math.degrees(NOISE):.2g}"
+    row = f"{measured:20}  {math.degrees(first.prediction):.6g} deg  {first.residual:+.2f}"
+    assert row in fit.details
+    panel = fit.plot().axes[0]
+    assert panel.get_ylabel() == "theta [deg]"
+    assert_close(panel.containers[0].lines[0].get_ydata(), [math.degrees(row.value) for row in fit.residuals])
+    assert fit.plot(unit="rad").axes[0].get_ylabel() == "theta [rad]"
 
 
 @pytest.mark.slow

@@ -61,6 +61,21 @@ def test_a_sweep_from_a_launch_in_degrees_is_shown_in_degrees(rutstam_scene_modu
     assert repr(tippe.Table.load(tmp_path / "table.h5")) == repr(table)
 
 
+def test_a_table_takes_a_launch(rutstam_scene_module):
+    launch = tippe.Launch.degrees(theta=[6, 9, 12], rpm=1500, azimuth=90)
+    arguments = {"mu": [0.2, 0.3], "t1": 0.1}
+    table = tippe.inversion_table(rutstam_scene_module, launch, **arguments)
+    numbers = {"theta": launch.theta, "spin": launch.spin, "azimuth": launch.azimuth}
+    in_radians = tippe.inversion_table(rutstam_scene_module, **numbers, **arguments)
+    assert list(table.coords) == ["theta", "mu"]
+    np.testing.assert_array_equal(table.theta, launch.theta)
+    np.testing.assert_array_equal(table.end_theta, in_radians.end_theta)
+    assert "end_theta [deg]" in repr(table)
+    assert "end_theta [rad]" in repr(in_radians)
+    with pytest.raises(ValueError, match="launch must be left out where its numbers are given"):
+        tippe.inversion_table(rutstam_scene_module, launch, theta=0.1, **arguments)
+
+
 def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, rutstam_scene_module, tmp_path):
     """A file of another limit is another request; the default limit is not in the request, so that older files resume."""
     arguments = {"theta": THETA, "spin": SPIN, "t1": 12.0, "path": tmp_path / "table.h5"}

@@ -29,7 +29,7 @@ def test_a_recorded_angle_in_degrees_is_refused():
 def test_unknown_errors_are_given_as_such_with_their_units():
     density, film = density_of_a_film()
     assert density.names == ("scene.friction.mu", "error[0]", "error[1]")
-    assert density.units == {"error[0]": "rad", "error[1]": "rad"}
+    assert density.units == {"scene.friction.mu": "s m-1", "error[0]": "rad", "error[1]": "rad"}
     guesses = np.asarray(film.measurements.error)[:2]
     values = density.values(jnp.array([np.log(0.2), np.log(2.0), 0.0]))
     np.testing.assert_allclose([values["error[0]"], values["error[1]"]], guesses * [2.0, 1.0], rtol=1e-12)

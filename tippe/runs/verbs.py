@@ -34,7 +34,7 @@ from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_se
 from nonholonomic.runs.table import TableForm, TableJob
 from nonholonomic.sweeps import Axis, Table, axis
 from nonholonomic.terminal import status_line
-from nonholonomic.text import shown
+from nonholonomic.text import shown, unit_of
 from nonholonomic.validation import (
     IN_DEGREES,
     as_number,
@@ -169,7 +169,7 @@ def launches(
 
     - `scene`: the scene; all its numbers must be scalars.
     - `launch_values`: parameter of the launch, or "mu" for the scene's friction -> a number or a list; `None` keeps the
-      scene's own `mu`.
+      scene's own `mu`; or "launch" -> a `Launch` with its parameters.
     - `axes`: full name of a parameter, or its unambiguous end -> values, or `None`; the numbers of a launch's vectors
       are `"launch.place[0]"` and so on; omitted numbers are 0.
     - `t1`, `tolerance`: as for `inversion_table`.
@@ -184,6 +184,14 @@ def launches(
     if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
         raise ValueError(f"axes = {shown(axes)} must be a dictionary, path of a number -> values")
     axes = full_axes(axes or {}, [*variable_numbers(scene), *NUMBERS_OF_A_LAUNCH])
+    stated, launch_values = launch_values.get("launch"), {k: v for k, v in launch_values.items() if k != "launch"}
+    if stated is not None:
+        require_kind(stated, "launch", Launch)
+        if any(np.any(value) for name, value in launch_values.items() if name != "mu"):
+            raise ValueError("launch must be left out where its numbers are given")
+        launch_values = {name: getattr(stated, name, value) for name, value in launch_values.items()}
+        others = {name: value for name, value in numbers("launch", stated).items() if value is not None}
+        axes = {name: value for name, value in others.items() if name[len("launch.") :] not in launch_values} | axes
     friction_numbers = numbers("scene.friction", scene.friction)
     of_mu = next((number for number in friction_numbers if number.endswith(".mu")), "scene.friction.mu")
     paths = {name: of_mu if name == "mu" else f"launch.{name}" for name in launch_values}
@@ -201,7 +209,7 @@ def launches(
         name: tuple(scalars.get(part, 0.0) for part in own) for name, own in parts.items() if set(own) & set(values)
     }
     angles = {name: scalars.get(f"launch.{name}", 0.0) for name in ("theta", "spin", "eta", "azimuth")}
-    launch = Launch(**angles, **vectors)
+    launch = Launch(**angles, **vectors).stated_in(unit_of(stated))
     names = TopModel(scene=scene, launch=launch).label(list(values), taken)
     listed = [(number, *names[number]) for number in values if number not in scalars]
     grid = [axis(name, number, unit, values[number], long_name) for number, name, unit, long_name in listed]
@@ -222,9 +230,10 @@ def too_many_steps(t1: float, max_steps: int, end: float) -> str:
 
 def inversion_table(
     scene: Scene,
+    launch: Launch | None = None,
     *,
-    theta: Any,
-    spin: Any,
+    theta: Any = None,
+    spin: Any = None,
     eta: Any = 0.0,
     mu: Any = None,
     t1: float,
@@ -248,9 +257,9 @@ def inversion_table(
     **Arguments:**
 
     - `scene`: the scene; all its numbers must be scalars.
-    - `theta`, `spin`, `eta`, `azimuth`: parameters of the launch, as for `Launch`; `mu`: coefficient of the scene's
-      friction law, by default that of the scene. Each list or array becomes an axis of the table, in the order (theta,
-      eta, mu, spin, azimuth).
+    - `launch`: a `Launch`; or `theta`, `spin`, `eta`, `azimuth`: its numbers; `mu`: coefficient of the scene's friction
+      law, by default that of the scene. Each list or array becomes an axis of the table, in the order (theta, eta, mu, spin,
+      azimuth). After `Launch.degrees`, texts and pictures of the table are in degrees and rpm.
     - `t1`: horizon [s].
     - `angle`: angle [rad] that counts as inverted. By default, a top with a stem counts as inverted when the stem first
       carries it, and any other body when theta reaches 0.95 pi.
@@ -322,7 +331,9 @@ def inversion_table(
 
     ```
     """
-    require_outside((scene, theta, spin, eta, mu, azimuth, axes, t1, angle), "inversion_table", "inversion_time")
+    require_outside(
+        (scene, launch, theta, spin, eta, mu, azimuth, axes, t1, angle), "inversion_table", "inversion_time"
+    )
     check_event(angle, crossing, ("first", "last", "both"))
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {shown(method)} must be 'ensemble' or 'diffrax'")
@@ -330,16 +341,17 @@ def inversion_table(
         raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {shown(crossing)} must be 'first' for method = 'diffrax'")
-    launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    launch_values = {"launch": launch, "theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
     return event_table(scene, launch_values, axes, t1, event_of(scene, angle), options, crossing, method)
 
 
 def reversal_table(
     scene: Scene,
+    launch: Launch | None = None,
     *,
-    theta: Any,
-    spin: Any,
+    theta: Any = None,
+    spin: Any = None,
     azimuth: Any = 0.0,
     mu: Any = None,
     t1: float,
@@ -378,9 +390,9 @@ def reversal_table(
 
     ```
     """
-    require_outside((scene, theta, spin, azimuth, mu, axes, t1), "reversal_table", "reversal_time")
+    require_outside((scene, launch, theta, spin, azimuth, mu, axes, t1), "reversal_table", "reversal_time")
     require_rigid(scene)
-    launch_values = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    launch_values = {"launch": launch, "theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
     return event_table(scene, launch_values, axes, t1, None, options)
 
@@ -449,9 +461,10 @@ def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
 
 def trajectory_table(
     scene: Scene,
+    launch: Launch | None = None,
     *,
-    theta: Any,
-    spin: Any,
+    theta: Any = None,
+    spin: Any = None,
     eta: Any = 0.0,
     mu: Any = None,
     times: Any,
@@ -473,7 +486,7 @@ def trajectory_table(
     **Arguments:**
 
     - `scene`: the scene; all its numbers must be scalars.
-    - `theta`, `spin`, `eta`: parameters of the launch, as for `Launch`; `mu`: coefficient of the scene's friction law,
+    - `launch`, `theta`, `spin`, `eta`: as for `inversion_table`; `mu`: coefficient of the scene's friction law,
       by default that of the scene. Each list or array becomes an axis of the table, in the order (theta, eta, mu,
       spin). The axes of the launch are called "launch.theta", "launch.eta" and "launch.spin", because `theta` is the
       sampled quantity.
@@ -512,7 +525,7 @@ def trajectory_table(
 
     ```
     """
-    require_outside((scene, theta, spin, eta, mu, times, axes), "trajectory_table", "simulate with times=")
+    require_outside((scene, launch, theta, spin, eta, mu, times, axes), "trajectory_table", "simulate with times=")
     require_kind(scene, "scene", Scene)
     require_times(as_number(times), None)
     samples = samples_of(quantities_of(scene), times, quantities, None)
@@ -520,7 +533,7 @@ def trajectory_table(
     options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor)
     settings, t1 = options.settings, samples.times[-1]
     require(t1, "times[-1]", above=0.0, why="it is the horizon")
-    launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}
+    launch_values = {"launch": launch, "theta": theta, "eta": eta, "mu": mu, "spin": spin}
     roots, grid = launches(scene, launch_values, axes, t1, tolerance, taken=QUANTITIES)
     model = TopModel(scene=roots["scene"], launch=roots["launch"])
     check_cells(model, grid, options)

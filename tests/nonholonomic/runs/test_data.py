@@ -98,15 +98,25 @@ def test_wrong_times_are_refused(arguments, message):
 
 def test_the_picture_of_a_fit_has_the_units_of_the_quantities():
     scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 2.994e-6, 3.2e-6), friction=tippe.Viscous(0.3))
-    launch, times = tippe.Launch(0.1, 155.0), jnp.linspace(0.02, 0.2, 10)
+    launch, times = tippe.Launch.degrees(6.0, 1500.0), jnp.linspace(0.02, 0.2, 10)
     run = tippe.simulate(scene, launch, 0.2, times=times, tolerance=1e-7)
     value = np.stack([run.theta, run.spin, run.position[:, 2]], axis=-1)
     names = ("theta", "spin", "position.z")
     data = nonholonomic.Recording(launch, times, value, [1e-3, 0.1, 1e-5], names)
     assert "theta" in run
     assert "tetha" not in run
-    fit = nonholonomic.identify(scene, data, {"launch.spin": 155.0}, starts=2, progress=False)
+    fit = nonholonomic.identify(scene, data, {"launch.spin": 157.0}, starts=2, progress=False)
     assert fit.density.series_units == ("rad", "rad/s", "m")
+    # By default in the units of the launch; the numbers stay in SI units.
+    spin, rpm = fit.estimates["launch.spin"], 30.0 / np.pi
+    estimate, low, high = fit.rounded("launch.spin", rpm)
+    assert (abs(spin - 50.0 * np.pi) < 0.1, abs(float(estimate) - rpm * spin) < 0.5) == (True, True)
+    assert f"launch.spin  {estimate} rpm  (95 %: {low} to {high}" in str(fit)
+    assert f"launch.spin  {rpm * spin:.6g} +- {rpm * fit.standard_errors['launch.spin']:.2g}" in fit.details
+    assert f"{np.degrees(fit.residuals[0].prediction):.6g} deg" in fit.details
+    axes = fit.plot().axes
+    assert [panel.get_ylabel() for panel in axes[:3]] == ["theta [deg]", "spin [rpm]", "position.z [m]"]
+    assert axes[4].get_xlabel() == "spin [rpm]"
     figure = fit.plot(unit=("deg", "rpm", "mm"))
     assert isinstance(figure, matplotlib.figure.Figure)
     labels = ["theta [deg]", "spin [rpm]", "position.z [mm]", "residual\n[standard errors]"]
