@@ -535,6 +535,13 @@ def test_a_message_names_the_argument_its_value_and_the_likely_fix(name):
         call()
 
 
+def test_a_fit_knows_which_numbers_of_the_launch_are_held_fixed():
+    data = tippe.Recording(LAUNCH, [0.1, 0.2], [0.1, 0.1], 0.01)
+    assert tippe.log_density(TOP, data, {"mu": 0.3}).problem.model.fixed == ("launch.theta", "launch.spin")
+    free = {"mu": 0.3, "launch.spin": 155.0}
+    assert tippe.log_density(TOP, data, free).problem.model.fixed == ("launch.theta",)
+
+
 def test_a_page_that_cannot_be_written_is_refused_before_it_is_drawn(monkeypatch):
     monkeypatch.setattr("tippe.Trajectory.stages", lambda *_: pytest.fail("it was drawn"))
     with pytest.raises(OSError, match=r"path = /proc/x\.html: nothing can be written there"):

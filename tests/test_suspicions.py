@@ -63,6 +63,10 @@ SUSPECTED = {
         lambda: tippe.Contensou(0.3, 1e-3, 50.0),
         "slip_speed = 50 m/s is large: was it in mm/s? 50 mm/s are 0.05 m/s",
     ),
+    "two times in ms": (
+        lambda: tippe.Recording(LAUNCH, [100.0, 200.0], [0.1, 0.2], 0.01),
+        "samples are 100 s apart; times are in seconds: did you mean 1e-3 * times?",
+    ),
     "a density in g/cm^3": (
         lambda: tippe.Top.turned(0.02, 0.7, cut=0.015, stem_radius=0.005, stem_length=0.012),
         "density = 0.7 kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? 0.7 g/cm^3 are 700 kg/m^3",

@@ -170,6 +170,7 @@ HEADERS = "t,tilt,x\n0.0,5,1\n0.1,6,2\n"
             None,
             "'time' = .'t', 's'. contradicts the header 't .ms.', whose unit is ms, not s",
         ),
+        ("PK\x03\x04", TIMED, None, r"film\.csv' is an Excel file, or another archive: save the sheet as CSV"),
         (HEADERS, {"theta": ("tlit", "deg")}, 25.0, "'tlit' must be one of the headers of .*; did you mean 'tilt'"),
         (HEADERS.replace("x", "tilt"), TIMED, None, "'theta' could be 'tilt' or 'tilt', columns of .*: rename one"),
         (
