@@ -210,7 +210,7 @@ class Obstacles(eqx.Module):
         others = Box((FAR, FAR), (1.0, 1.0)).corners, np.full(2, FAR), np.ones(()), ABOVE, ABOVE
         counts, parts = (boxes, discs, discs, boxes, discs), jax.tree.leaves(self)
         more = [np.broadcast_to(far, (n - len(a), *far.shape)) for a, far, n in zip(parts, others, counts, strict=True)]
-        return Obstacles(*(jnp.asarray(np.concatenate(pair)) for pair in zip(parts, more, strict=True)))
+        return Obstacles(*(np.concatenate(pair) for pair in zip(parts, more, strict=True)))
 
     def gaps(self, corners: Corners) -> Numbers:
         """A lower bound [m] of the distance of footprints from every obstacle, with a slope everywhere."""

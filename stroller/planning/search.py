@@ -102,7 +102,7 @@ class Search:
         self.problem, self.costs, self.has_heading = problem, costs, problem.goal.heading is not None
         start, self.goal = problem.point(problem.start_pose), problem.point(problem.goal_pose)
         # NumPy would otherwise dispatch every operation with these to JAX.
-        obstacles, footprint = jax.tree.map(np.asarray, (Obstacles.of(problem.standing, 1), problem.footprint))
+        obstacles, footprint = Obstacles.of(problem.standing, 1), jax.tree.map(np.asarray, problem.footprint)
         self.obstacles, self.footprint = obstacles, footprint
         low, high, space = problem.turns
         self.least, self.greatest = max(low, share * low), min(high, share * high)

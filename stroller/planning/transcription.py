@@ -183,7 +183,7 @@ class Task(eqx.Module):
         return cls(
             dynamics=problem.scene.dynamics,
             footprint=problem.footprint,
-            obstacles=Obstacles.of(problem.standing),
+            obstacles=jax.tree.map(jnp.asarray, Obstacles.of(problem.standing)),
             start=(problem.start_pose, launch.steering, launch.steering_rate, launch.speed / jnp.cos(launch.steering)),
             goal=(problem.goal_pose, goal.speed),
             has_heading=jnp.asarray(0.0 if goal.heading is None else 1.0),
