@@ -75,7 +75,7 @@ def test_friction_from_a_film(rutstam_scene, tmp_path):
     # Texts and pictures are in the unit of the file; the numbers are in SI units.
     assert_close([row.value for row in fit.residuals[:5]], value[:5, 0], rtol=1e-12)
     first = fit.residuals[0]
-    measured = f"{math.degrees(first.value):.6g} +- {math.degrees(NOISE):.2g}"
+    measured = f" {math.degrees(first.value):.6g} +- {math.degrees(NOISE):.2g}"
     row = f"{measured:20}  {math.degrees(first.prediction):.6g} deg  {first.residual:+.2f}"
     assert row in fit.details
     panel = fit.plot().axes[0]
