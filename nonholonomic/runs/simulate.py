@@ -51,21 +51,20 @@ class Samples(NamedTuple):
         vectors = [Axis(dim, dim, "1", np.array(model.components[dim])) for dim in dims if dim is not None]
         return [axis("time", "time", "s", self.times, "time"), *vectors]
 
-
-def solve_samples(
-    cells: AbstractModel, samples: Samples, t1: float, size: int, count: int, settings: Settings
-) -> tuple[Int[Array, " cells"], dict[str, Array]]:
-    """The `Status` of all cells, of which only the first `count` are run, and the variables of the table."""
-    names, times = samples.names, jnp.asarray(samples.times, float)
-    horizon = (jnp.asarray(t1, float), jnp.asarray(count), settings)
-    if cells.smooth:
-        outcome, status, values = _followed(problem_of(cells, size, names), cells, names, times, *horizon)
-        values |= {"end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
-    else:
-        start, counters = modes_of(cells, size, settings.tolerance, names), len(cells.counters)
-        run, _ = solve_hybrid_with_samples(*start, times, *horizon, counters=counters)
-        status, values = _read_samples(cells, names, times, run, settings.tolerance)
-    return status, jax.tree.map(np.asarray, values)
+    def solve(
+        self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
+    ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
+        """The `Status` of all cells, of which only the first `count` are run, and the variables of the table."""
+        names, times = self.names, jnp.asarray(self.times, float)
+        horizon = (jnp.asarray(t1, float), jnp.asarray(count), settings)
+        if cells.smooth:
+            outcome, status, values = _followed(problem_of(cells, size, names), cells, names, times, *horizon)
+            values |= {"end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
+        else:
+            start, counters = modes_of(cells, size, settings.tolerance, names), len(cells.counters)
+            run, _ = solve_hybrid_with_samples(*start, times, *horizon, counters=counters)
+            status, values = _read_samples(cells, names, times, run, settings.tolerance)
+        return status, jax.tree.map(np.asarray, values)
 
 
 # Compiled on its own, not inside other transformed functions; otherwise it does not get the compiler's options.
@@ -82,10 +81,10 @@ def _followed(
     """The outcome of the runs, their `Status`, and the named quantities at the samples."""
 
     def read(cell: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> dict[str, Array]:
-        of_lanes = jax.tree.map(lambda leaf: leaf if _own_axis(leaf) is None else leaf[cell], cells)
+        of_lanes = jax.tree.map(lambda leaf: leaf if own_axis(leaf) is None else leaf[cell], cells)
         return eqx.filter_vmap(
             lambda model, states: model.read(names, jnp.full(len(states), jnp.nan), states.T, None),
-            in_axes=(_own_axis, -1),
+            in_axes=(own_axis, -1),
             out_axes=1,
         )(of_lanes, states)
 
@@ -94,7 +93,7 @@ def _followed(
     return outcome, cells.ended(outcome, settings.tolerance), samples
 
 
-def _own_axis(leaf: Any) -> int | None:
+def own_axis(leaf: Any) -> int | None:
     return 0 if eqx.is_array(leaf) and leaf.ndim else None
 
 
@@ -140,7 +139,7 @@ def _read_samples(
         }
 
     outcome = outcome_of(samples)
-    axes = (_own_axis, 0, 0, 0)
+    axes = (own_axis, 0, 0, 0)
     values = eqx.filter_vmap(of_cell, in_axes=axes)(cells, samples.states, samples.number, samples.end_time)
     ending = {"end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
     return cells.ended(outcome, tolerance), values | ending | dict(zip(cells.counters, outcome.counts, strict=True))

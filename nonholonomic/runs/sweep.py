@@ -189,17 +189,13 @@ def sweep(
     ```
     """
     require_outside((system, start, t1, axes, input), "sweep", "simulate or event_time")
-    if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
-        raise ValueError(f"axes = {shown(axes)} must be a dictionary, name of a number -> values")
     if crossing not in ("first", "last", "both"):
         raise ValueError(f"crossing = {shown(crossing)} must be 'first', 'last' or 'both'")
     model = model_of(system, start, event, input, jumps)
     check_horizon(t1, tolerance)
     samples = samples_of(model.quantities, times, quantities, t1)
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
-    named = {model.full_name("axes", name): values for name, values in axes.items()}
-    if len(named) < len(axes):
-        raise ValueError(f"axes = {', '.join(axes)}: a number is named twice")
+    named = named_axes(model, axes)
     timed = samples is None or event is not None
     for name, option in {"errors": errors, "sensitivities": list(sensitivities)}.items() if not timed else ():
         if option:
@@ -210,19 +206,34 @@ def sweep(
     return table_of(model, named, float(t1), crossing, options, TableForm(), samples=samples, timed=timed)
 
 
+def named_axes(model: AbstractModel, axes: Any) -> dict[str, Any]:
+    """The axes of a table by the full names of their parameters, checked."""
+    if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
+        raise ValueError(f"axes = {shown(axes)} must be a dictionary, name of a number -> values")
+    named = {model.full_name("axes", name): values for name, values in axes.items()}
+    if len(named) < len(axes):
+        raise ValueError(f"axes = {', '.join(axes)}: a number is named twice")
+    return named
+
+
 def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Number | None) -> Samples | None:
     """The samples of a table, checked. **Arguments:** `known`: the quantities of the model."""
     if times is None and not len(quantities):
         return None
     if times is None or isinstance(quantities, str) or not isinstance(quantities, Sequence) or not quantities:
         raise ValueError(f"quantities = {shown(quantities)} must be a list of names, with the times to sample them")
+    require_names(known, quantities)
+    require_times(as_number(times), t1)
+    return Samples(np.asarray(times, float), tuple(quantities))
+
+
+def require_names(known: dict[str, Quantity], quantities: Sequence[str]) -> None:
+    """Raise `ValueError` unless these are names of quantities, each named once."""
     for name in quantities:
         if name not in known:
             raise ValueError(f"quantities: {shown(name)} must be one of {', '.join(known)}{likely(name, known)}")
         if list(quantities).count(name) > 1:
             raise ValueError(f"quantities: {shown(name)} must be named only once")
-    require_times(as_number(times), t1)
-    return Samples(np.asarray(times, float), tuple(quantities))
 
 
 def table_of(

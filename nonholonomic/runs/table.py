@@ -17,7 +17,7 @@ from ..sweeps import Variable
 from ..validation import as_number
 from .event import SILENT, Ensemble, status_of
 from .model import AbstractModel, Number
-from .simulate import Samples, solve_samples
+from .simulate import Samples
 
 #: The words for how a run ends, in the order of `Status`.
 WORDS = tuple(status.word for status in sorted(Status)[1:])
@@ -153,7 +153,7 @@ class TableJob(NamedTuple):
         cells = self.model.replaced(columns)
         sampled: dict[str, Any] = {}
         if self.samples is not None:
-            status, sampled = solve_samples(cells, self.samples, self.t1, size, count, self.settings)
+            status, sampled = self.samples.solve(cells, self.t1, size, count, self.settings)
             sampled["status"] = self.form.codes[np.asarray(status)]
         if not self.timed:
             return sampled

@@ -1,0 +1,338 @@
+"""The crossings of a section by many runs: the times at which an event function falls through zero, and the states there.
+
+A run continues through its crossings and through its resets; nothing starts again. The steps that cross are recorded in the
+lanes, and the resets that cross in the rounds of the modes.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from ..compilation.xla_cpu import compiled_alone, greatest, written_in_place
+from ..hybrid.ensemble import after_reset, after_solve, all_rounds, at_start, chosen, over_cells, selected_cells
+from ..integration import AbstractProblem, Lanes, LaneState, Settings, States
+from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, LEFT_DOMAIN, RUNNING, Status
+from ..integration.scheduler import InLanes, LaneScheduler, Recorder, of_cells
+from ..integration.step import try_step
+from ..sweeps import Axis, Table, Variable
+from ..text import shown
+from ..validation import require_outside, require_whole
+from .event import modes_of, problem_of
+from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
+from .simulate import Samples, mode_at, own_axis
+from .sweep import Options, named_axes, require_names, table_of
+from .table import TableForm
+
+#: A crossing within this fraction of the time in a mode before the end of the mode is at its end: the event function vanishes
+#: with the margin of the mode.
+SAME = 1e-9
+
+#: A run with more resets between two crossings ends as `UNRESOLVED`.
+MOST_ROUNDS = 2000
+
+
+class Kept(NamedTuple):
+    """What is kept of the crossings of every cell: the number so far, whether the last one is at the end of a mode whose reset
+    comes next, and of those that are asked for the times [s], the states and the modes, with the cells last."""
+
+    counted: Int[Array, " cells"]
+    at_end: Bool[Array, " cells"]
+    time: Float[Array, "count cells"]
+    state: Float[Array, "components count cells"]
+    mode: Int[Array, "count cells"]
+
+
+class CrossingRecorder(Recorder):
+    """Keeps the crossings inside the steps of every cell, and ends a run at the last one that is asked for.
+
+    `skip`, `count`: as for `crossings`; `begin_time`: when each cell began [s]; `number`: the index of its mode.
+    """
+
+    skip: Int[Array, ""]
+    count: int = eqx.field(static=True)
+    begin_time: Float[Array, " cells"]
+    number: int = eqx.field(static=True)
+
+    period: ClassVar[int] = 64
+
+    def begin(self, in_lanes: InLanes, lane_state: LaneState, collected: Kept) -> PyTree:
+        state = lane_state.state
+        rows = jnp.zeros((self.period, len(state) + 1, *state.shape[1:]))
+        return collected.counted[lane_state.cell], rows, jnp.full((self.period, *state.shape[1:]), self.count)
+
+    def step(
+        self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, PyTree]:
+        (counted, rows, places), new = record, try_step(*in_lanes, lane_state)
+        crosses = jnp.isfinite(new.crossing_time) & (new.crossing_time != lane_state.crossing_time)
+        counted = counted + crosses
+        # The step has ended just beyond the section.
+        state = new.state + (new.crossing_time - new.time) * new.rate
+        row = jnp.concatenate([state, new.crossing_time[None]])
+        place = jnp.where(crosses, place_of(counted, self.skip, self.count), self.count)
+        rows, places = written_in_place(rows, row, at=iteration), written_in_place(places, place, at=iteration)
+        is_last = crosses & (counted >= self.skip + self.count) & (new.status == RUNNING)
+        return new._replace(status=jnp.where(is_last, CROSSED, new.status)), (counted, rows, places)
+
+    def collect(self, collected: Kept, record: PyTree, ended: LaneState, refilled: LaneState) -> Kept:
+        (counted, rows, places), cell = record, ended.cell
+        begin, cells = self.begin_time[cell], jnp.broadcast_to(cell, places.shape)
+        return Kept(
+            collected.counted.at[cell].set(counted, mode="drop"),
+            collected.at_end,
+            collected.time.at[places, cells].set(begin + rows[:, -1], mode="drop"),
+            collected.state.at[:, places, cells].set(jnp.moveaxis(rows[:, :-1], 1, 0), mode="drop"),
+            collected.mode.at[places, cells].set(self.number, mode="drop"),
+        )
+
+
+def place_of(counted: Int[Array, "..."], skip: Array, count: int) -> Int[Array, "..."]:
+    """Where to keep the crossing of this number, counted from 1; `count` if it is not kept."""
+    return jnp.where((counted > skip) & (counted <= skip + count), counted - skip - 1, count)
+
+
+def on_margin(problem: AbstractProblem, outcome: Any) -> Bool[Array, " cells"]:
+    """Whether runs have ended where their mode ends too, up to `SAME`."""
+    time, state = outcome.end_time, outcome.state
+
+    def margin(state: States) -> Lanes:
+        value = problem.domain_margin(time, state)
+        return jnp.ones_like(time) if value is None else value
+
+    value, slope = jax.jvp(margin, (state,), (problem.field(time, state),))
+    return (slope < 0.0) & (value <= -slope * SAME * time)
+
+
+@compiled_alone
+def crossings_in_cells(
+    model: AbstractModel,
+    names: tuple[str, ...],
+    t1: Float[Array, ""],
+    cells: Int[Array, ""],
+    skip: Int[Array, ""],
+    settings: Settings,
+    size: int,
+    count: int,
+    after: bool,
+) -> tuple[Int[Array, " cells"], dict[str, Array]]:
+    """The `Status` of all cells, of which only the first `cells` are run, and the variables of the table."""
+
+    def followed(problem: AbstractProblem, t1: Array, kept: Kept, begin: Array, number: int, cells: Array) -> Any:
+        scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=True)
+        outcome, _, kept = scheduler.solve(CrossingRecorder(skip, count, begin, number), kept)
+        return outcome, kept
+
+    def start(components: int) -> Kept:
+        never, none = jnp.full((count, size), jnp.nan), jnp.zeros((count, size), int)
+        state = jnp.full((components, count, size), jnp.nan)
+        return Kept(jnp.zeros(size, int), jnp.zeros(size, bool), never, state, none)
+
+    if model.smooth:
+        problem = problem_of(model, size, names)
+        outcome, kept = followed(problem, t1, start(len(problem.start()[0])), jnp.zeros(size), 0, cells)
+        rows, ended, counted = kept.state, outcome, ()
+    else:
+        modes, first, states = modes_of(model, size, settings.tolerance, names, True)
+        horizon = jnp.broadcast_to(t1, (size,))
+
+        def solve(numbers: Sequence[int], carry: PyTree, active: Bool[Array, " cells"]) -> PyTree:
+            (runs, kept), cell = carry, selected_cells(active)
+            left = jnp.where(active, greatest(horizon - runs.end_time, 0.0), 0.0)
+            problem = of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
+            outcome, new = followed(problem, left, kept, runs.end_time, numbers[0], jnp.asarray(size))
+            if after:
+                is_reset = (outcome.status == CROSSED) & on_margin(problem, outcome)
+                outcome = outcome._replace(status=jnp.where(is_reset, LEFT_DOMAIN, outcome.status))
+            at_end = (outcome.end_time - outcome.crossing_time <= SAME * outcome.end_time) & jnp.isfinite(outcome.crossing_time)
+            new = new._replace(at_end=at_end & (outcome.status == LEFT_DOMAIN))
+            return chosen(active, (after_solve(runs, outcome, horizon), new), carry)
+
+        def reset(numbers: Sequence[int], carry: PyTree, lost: Bool[Array, " cells"]) -> PyTree:
+            (runs, kept), cell = carry, selected_cells(lost)
+            left = greatest(horizon[cell] - runs.end_time[cell], 0.0)
+            transition = of_cells(modes[numbers[0]], cell).reset_map(runs.state[:, cell], left)
+            new, time = after_reset(runs, transition, horizon), runs.end_time + transition.crossing_time
+            crosses = lost & (jnp.isfinite(time) | kept.at_end)
+            time = jnp.where(jnp.isfinite(time), time, runs.end_time)
+            is_new = crosses & ~kept.at_end
+            counted = kept.counted + is_new
+            place = jnp.where(crosses if after else is_new, place_of(counted, skip, count), count)
+            state, mode = (new.state, new.mode) if after else (runs.state, runs.mode)
+            all_cells = jnp.arange(size)
+            kept = Kept(
+                counted,
+                kept.at_end & ~lost,
+                kept.time.at[place, all_cells].set(time, mode="drop"),
+                kept.state.at[:, place, all_cells].set(state, mode="drop"),
+                kept.mode.at[place, all_cells].set(mode, mode="drop"),
+            )
+            is_last = (counted >= skip + count) & (new.status == RUNNING)
+            new = new._replace(status=jnp.where(is_last, CROSSED, new.status))
+            return chosen(lost, new, runs), kept
+
+        groups, runs = [(number,) for number in range(len(modes))], at_start(first, states, cells, len(model.counters))
+        most = MOST_ROUNDS * (count + skip)
+        ended, kept = all_rounds((runs, start(len(states))), groups, solve, reset, most)
+        counted = ended.counts
+        rows = jnp.full_like(over_cells(lambda mode, state: mode.shown(state), modes[0])(kept.state), jnp.nan)
+        for number, mode in enumerate(modes):
+            of_this = over_cells(lambda mode, state: mode.shown(state), mode)(kept.state)
+            rows = jnp.where(kept.mode == number, of_this, rows)
+    status = jnp.where(kept.counted >= skip + count, int(Status.EVENT), model.ended(ended, settings.tolerance))
+
+    def read(model: AbstractModel, time: Array, rows: Array, mode: Array) -> dict[str, Array]:
+        values = model.read(names, time, rows, None if model.smooth else mode_at(mode))
+        is_kept = jnp.isfinite(time)
+        return {
+            name: jnp.where(is_kept.reshape(-1, *[1] * (part.ndim - 1)), part, jnp.nan) for name, part in values.items()
+        }
+
+    values = eqx.filter_vmap(read, in_axes=(own_axis, -1, -1, -1))(model, kept.time, rows, kept.mode)
+    counts = {"steps": ended.steps, "rejected": ended.rejected} | dict(zip(model.counters, counted, strict=True))
+    return status, {"time": kept.time.T, "end_time": ended.end_time} | values | counts
+
+
+class Crossings(NamedTuple):
+    """The crossings in a table: the names of the quantities, and as for `crossings`."""
+
+    names: tuple[str, ...]
+    skip: int
+    count: int
+    side: str
+
+    @property
+    def times(self) -> np.ndarray:
+        """The numbers of the crossings, counted from 1."""
+        return np.arange(self.skip + 1, self.skip + self.count + 1)
+
+    def variables(self, model: AbstractModel) -> dict[str, Variable]:
+        """The variables of the table with the times and the quantities."""
+        quantities = Samples(self.times, self.names).variables(model)
+        variables = {"time": Variable("s", np.float64, inner=("crossing",), long_name="time of the crossing")}
+        return variables | {
+            name: variable._replace(inner=("crossing", *variable.inner[1:])) for name, variable in quantities.items()
+        }
+
+    def inner(self, model: AbstractModel) -> list[Axis]:
+        """The dimensions of these variables."""
+        _, *vectors = Samples(self.times, self.names).inner(model)
+        return [Axis("crossing", "crossing", "1", self.times, "crossing"), *vectors]
+
+    def solve(
+        self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
+    ) -> tuple[Int[Array, " cells"], dict[str, np.ndarray]]:
+        """The `Status` of all cells, of which only the first `count` are run, and the variables of the table."""
+        numbers = (jnp.asarray(t1, float), jnp.asarray(count), jnp.asarray(self.skip))
+        options = (size, self.count, self.side == "after")
+        status, values = crossings_in_cells(cells, self.names, *numbers, settings, *options)
+        return status, jax.tree.map(np.asarray, values)
+
+
+class Rise(eqx.Module):
+    """An event that happens where another function rises through zero."""
+
+    event: Callable[..., Any]
+
+    def __call__(self, t: Any, y: Any) -> Any:
+        return -self.event(t, y)
+
+
+def section_of(event: Any, direction: str, side: str) -> Any:
+    """The event of a section, checked."""
+    if direction not in ("fall", "rise"):
+        raise ValueError(f"direction = {shown(direction)} must be 'fall' or 'rise'")
+    if side not in ("before", "after"):
+        raise ValueError(f"side = {shown(side)} must be 'before' or 'after' a reset")
+    if direction == "rise" and not callable(event):
+        raise ValueError(f"direction = 'rise' needs event=, a function of time and state, not {shown(event)}")
+    return Rise(event) if direction == "rise" else event
+
+
+def crossings(
+    system: object,
+    start: object,
+    t1: float,
+    event: Callable[..., Any] | None = None,
+    count: int = 10,
+    skip: int = 0,
+    *,
+    direction: str = "fall",
+    side: str = "before",
+    axes: dict[str, Any] | None = None,
+    quantities: Sequence[str] | None = None,
+    scattered: bool = False,
+    max_steps: int = DEFAULT_MAX_STEPS,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+    path: str | Path | None = None,
+    progress: bool = True,
+    executor: Executor | None = None,
+    input: object = None,
+    jumps: object = None,
+) -> Table:
+    """Times and states at which runs cross a section: the returns of a Poincaré map, over a grid of parameters.
+
+    A crossing is a fall of the event function through zero, along the motion or by a reset. A start on the section does not
+    count. Runs continue through their crossings and resets, and end at the last crossing that is asked for.
+
+    **Arguments:**
+
+    - `system`, `start`, `event`, `input`, `jumps`: as for `event_time`; a scene needs an `event`.
+    - `t1`: horizon [s]; a run that has fewer crossings until then has fewer in the table.
+    - `count`, `skip`: number of crossings in the table, and of those before them that are left out.
+    - `direction`: "fall", or "rise" for the rises of the event function through zero.
+    - `side`: whether the state at a crossing that coincides with a reset is that "before" or "after" the reset.
+    - `axes`, `scattered`, `max_steps`, `tolerance`, `solver`, `path`, `progress`, `executor`: as for `sweep`; without axes
+      there is one run.
+    - `quantities`: names of quantities at the crossings; by default all components of your own system, and none of a scene.
+
+    **Returns:** a `Table` with the axis `crossing`, whose values count the crossings from 1: the `time` [s] of each crossing,
+    and the quantities, NaN for missing crossings; and for each run its `status`: "event" if all crossings were found,
+    otherwise how the run ended, such as "completed" at `t1`; `end_time` [s], `steps`, `rejected`, and the number of resets.
+
+    **Raises:** as `sweep`.
+
+    **Example:** the velocity at the lowest point of a swing, in its second and third period.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Spring(nonholonomic.AbstractMode):
+    ...     damping: float
+    ...
+    ...     def field(self, t, y):
+    ...         return jnp.array([y[1], -y[0] - self.damping * y[1]])
+    >>> def middle(t, y):
+    ...     return y[0]
+    >>> spring = nonholonomic.Hybrid([Spring(damping=0.1)])
+    >>> table = nonholonomic.crossings(spring, [1.0, 0.0], 50.0, middle, count=2, skip=1, progress=False)
+    >>> print(table.crossing, table.time.round(6), table.y1.round(6), table.status)
+    [2 3] [ 7.922167 14.213214] [-0.672961 -0.491359] event
+
+    ```
+    """
+    require_outside((system, start, t1, axes, input), "crossings", "event_time")
+    for name, number, least in (("count", count, 1), ("skip", skip, 0)):
+        require_whole(number, name, least)
+    model = model_of(system, start, section_of(event, direction, side), input, jumps)
+    is_scene = isinstance(model, AbstractSceneModel)
+    if is_scene and event is None:
+        raise ValueError("event = None: the section of a scene needs event=, a function of time and motion")
+    require_event(model)
+    check_horizon(t1, tolerance)
+    names = (() if is_scene else tuple(model.quantities)) if quantities is None else quantities
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        raise ValueError(f"quantities = {shown(quantities)} must be a list of names")
+    require_names(model.quantities, names)
+    options = Options(tolerance, solver, max_steps, scattered, False, (), path, progress, executor)
+    samples = Crossings(tuple(names), int(skip), int(count), side)
+    named = named_axes(model, {} if axes is None else axes)
+    return table_of(model, named, float(t1), "first", options, TableForm(), samples=samples, timed=False)
