@@ -38,6 +38,8 @@ from .runs.identify import Recording as Recording
 from .runs.identify import identify as identify
 from .runs.identify import log_density as log_density
 from .runs.lyapunov import lyapunov_exponent as lyapunov_exponent
+from .runs.orbit import Orbit as Orbit
+from .runs.orbit import periodic_orbit as periodic_orbit
 from .runs.simulate import simulate as simulate
 from .runs.sweep import sweep as sweep
 from .runs.trajectory import Trajectory as Trajectory

@@ -160,7 +160,12 @@ class VariationalMode(AbstractBatchedMode):
         def margin_and_rate(primal: States, *numbers: Array) -> tuple[Array, Array]:
             problem = build(*numbers).problem(primal)
             rates = problem.field(duration, primal)
-            return jax.jvp(lambda primal: problem.domain_margin(duration, primal), (primal,), (rates,))
+
+            def margin(primal: States) -> Lanes:
+                value = problem.domain_margin(duration, primal)
+                return jnp.ones_like(duration) if value is None else value
+
+            return jax.jvp(margin, (primal,), (rates,))
 
         (_, rate), (domain_margins, changes) = along(margin_and_rate, (primal, *numbers), directions)
         # A mode that ended when it began has not reached its event.

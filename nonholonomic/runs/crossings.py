@@ -99,9 +99,8 @@ def place_of(counted: Int[Array, "..."], skip: Array, count: int) -> Int[Array, 
     return jnp.where((counted > skip) & (counted <= skip + count), counted - skip - 1, count)
 
 
-def on_margin(problem: AbstractProblem, outcome: Any) -> Bool[Array, " cells"]:
-    """Whether runs have ended where their mode ends too, up to `SAME`."""
-    time, state = outcome.end_time, outcome.state
+def on_margin(problem: AbstractProblem, time: Lanes, state: States) -> Bool[Array, " cells"]:
+    """Whether runs that have spent some time [s] in a mode are at its end, up to `SAME`."""
 
     def margin(state: States) -> Lanes:
         value = problem.domain_margin(time, state)
@@ -149,9 +148,11 @@ def crossings_in_cells(
             problem = of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
             outcome, new = followed(problem, left, kept, runs.end_time, numbers[0], jnp.asarray(size))
             if after:
-                is_reset = (outcome.status == CROSSED) & on_margin(problem, outcome)
+                is_reset = (outcome.status == CROSSED) & on_margin(problem, outcome.end_time, outcome.state)
                 outcome = outcome._replace(status=jnp.where(is_reset, LEFT_DOMAIN, outcome.status))
-            at_end = (outcome.end_time - outcome.crossing_time <= SAME * outcome.end_time) & jnp.isfinite(outcome.crossing_time)
+            at_end = (outcome.end_time - outcome.crossing_time <= SAME * outcome.end_time) & jnp.isfinite(
+                outcome.crossing_time
+            )
             new = new._replace(at_end=at_end & (outcome.status == LEFT_DOMAIN))
             return chosen(active, (after_solve(runs, outcome, horizon), new), carry)
 

@@ -266,7 +266,7 @@ def _after_reset(mode: BatchedMode, state: Float[Array, " components"], exit: In
     if mode.continues:
         return Transition(number, state_after, now, status, jnp.where(crossed, now, never), zero[None] + 1)
     return Transition(
-        mode=jnp.where(ends, mode.index, jnp.where(jumps, form.modes, number)),
+        mode=jnp.where(ends, mode.index, jnp.where(jumps, form.modes + number, number)),
         state=jnp.where(ends, state, state_after),
         elapsed=now,
         status=jnp.where(crossed, CROSSED, status),

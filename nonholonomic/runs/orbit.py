@@ -1,0 +1,558 @@
+"""Periodic orbits of own systems: fixed points of the return map, by Newton's method with its exact Jacobian.
+
+The return map leads from a state to the state at the next crossing of a section, or after a given period. Its derivatives pass
+through the resets (`hybrid/saltation.py`). Newton's method goes on at a hundredth of the tolerance in its last step, which
+bounds the error. The derivatives of an orbit follow from the implicit function theorem: (1 - J) dy = dP.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int, PyTree
+
+from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, tangent_scale, tangents_by
+from ..hybrid import solve_hybrid
+from ..hybrid.saltation import VariationalMode, along, delay, variational_modes, variational_start
+from ..integration import Settings
+from ..integration.problem import CROSSED, REACHED_END, TIGHTEST, legal_run
+from ..terminal import status_line
+from ..text import shown
+from ..validation import as_number, is_traced, nan_unless
+from .crossings import on_margin, section_of
+from .event import Ensemble
+from .model import AbstractModel, check_run, model_of, require_event, settings_for_lanes
+
+#: The most Newton steps; the residual at which they have converged, in units of the tolerance; the tolerance of the last step.
+MOST_NEWTON, CONVERGED, FINER = 30, 30.0, 100.0
+
+#: Directions in which 1 - J is smaller than this fraction of its norm belong to a family of orbits.
+RANK = 1e-7
+
+#: A guess this near the section, in units of the period, lies on it.
+NEAR = 0.05
+
+#: Relative steps of a number for the differences that give the derivatives of multipliers, and their weights.
+STENCIL, STENCIL_STEP = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0)), 1e-3
+
+#: Ratio of the error bound to the last Newton step.
+SAFETY = 5.0
+
+#: The number of parts of an orbit.
+PARTS = 9
+
+
+#: Why there is no orbit, by `Orbit.reason`.
+REASONS = (
+    "",
+    "the section was not crossed again within t1 = {t1:.6g} s from there",
+    "the return from there ends in another mode than the first",
+    "a return from there still misses it by {residual:.2g} after {steps} Newton steps",
+    "a number is illegal",
+)
+
+
+class Orbit(eqx.Module):
+    """A periodic orbit, as `periodic_orbit` returns it.
+
+    - `period` [s]; `state`: the state on the section, just after the reset if the section is at a reset.
+    - `multipliers`: the eigenvalues of the derivative of the return map, the largest first; for a section without that of the
+      direction along the motion.
+    - `error`: bound of the errors of the components of the state.
+    - `family`: number of directions in which neighbouring orbits lie, because a quantity is conserved or the motion can be
+      shifted; the orbit is then one of a family near the guess.
+    - `iterations`: number of Newton steps; `residual`: by how much the last return missed; `reason`: 0, or why there is no
+      orbit, as an integer; the other numbers are then NaN or have no meaning.
+
+    **Example:** as for `periodic_orbit`.
+
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> nonholonomic.Orbit(jnp.array(2.0), jnp.array([1.0]), jnp.array([0.5 + 0.0j]), 1e-12, 1e-13, 0, 3, 0, ("y0",)).stable
+    Array(True, dtype=bool)
+    """
+
+    period: Float[ArrayLike, "..."]
+    state: Float[ArrayLike, "... components"]
+    multipliers: Complex[ArrayLike, "... multipliers"]
+    error: Float[ArrayLike, "..."]
+    residual: Float[ArrayLike, "..."]
+    family: Int[ArrayLike, "..."]
+    iterations: Int[ArrayLike, "..."]
+    reason: Int[ArrayLike, "..."]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def stable(self) -> Bool[Array, "..."]:
+        """Whether all multipliers lie inside the unit circle, apart from those of a family, which are 1."""
+        nearest = jnp.argsort(jnp.argsort(jnp.abs(self.multipliers - 1.0), axis=-1), axis=-1)
+        is_own = nearest < jnp.asarray(self.family)[..., None]
+        return jnp.all(is_own | (jnp.abs(self.multipliers) < 1.0), axis=-1)
+
+    @property
+    def status(self) -> str:
+        """How the search has ended: "completed", or "unresolved" or "illegal" without an orbit."""
+        reason = int(self.reason)
+        return "illegal" if reason == len(REASONS) - 1 else "unresolved" if reason else "completed"
+
+    def __repr__(self) -> str:
+        if is_traced(self) or np.ndim(self.period):
+            return f"Orbit(period={shown(self.period)}, state={shown(self.state)})"
+        values = np.asarray(self.multipliers).tolist()
+        multipliers = [f"{value.real:.8g}" + f"{value.imag:+.8g}j" * bool(value.imag) for value in values]
+        pairs = zip(self.names, np.asarray(self.state).tolist(), strict=True)
+        lines = [
+            f"{'stable' if self.stable else 'unstable'} periodic orbit with a period of {float(self.period):.12g} s",
+            ", ".join(f"{name} = {value:.12g}" for name, value in pairs),
+            f"multipliers {', '.join(multipliers)}",
+            f"error below {float(self.error):.1g}, Newton steps {int(self.iterations)}",
+        ]
+        if int(self.family):
+            lines.append(f"one of a family of orbits, in {int(self.family)} direction(s)")
+        return "\n  ".join(lines)
+
+
+class Return(NamedTuple):
+    """A return.
+
+    - `time` [s], `state`: when and where, (cells,) and (components, cells); `rate`: of the state there.
+    - `by_state`, `time_by_state`: derivatives by the start, (cells, components, components) and (cells, components);
+      `by_numbers`, `time_by_numbers`: those by each other number, (cells, components) and (cells,).
+    - `in_motion`: whether it is not at a reset; `has_returned`; `is_home`: whether it ends in the mode of the start.
+    """
+
+    time: Array
+    state: Array
+    rate: Array
+    by_state: Array
+    time_by_state: Array
+    by_numbers: list[Array]
+    time_by_numbers: list[Array]
+    in_motion: Array
+    has_returned: Array
+    is_home: Array
+
+
+class Newton(NamedTuple):
+    """The state of Newton's iteration, and its last return.
+
+    - `count`: number of returns so far; `state`: (components, cells); `is_done`, `is_finished`: whether all cells have
+      converged, also at the finer tolerance; `reason`: as for `Orbit`, where the search has been given up; `iterations`.
+    - `in_motion`, `time`, `by_state`, `time_by_state`: of the last return; `inverse`: of 1 - J; `rank`: of 1 - J.
+    - `residual`, `step`: by how much the last return missed, and the length of the last step.
+    """
+
+    count: Array
+    state: Array
+    is_done: Array
+    is_finished: Array
+    reason: Array
+    iterations: Array
+    in_motion: Array
+    time: Array
+    by_state: Array
+    time_by_state: Array
+    inverse: Array
+    rank: Array
+    residual: Array
+    step: Array
+
+
+class OrbitSolve(AbstractDifferentiableSolve):
+    """Periodic orbits of cells. The leaves are the horizon or the period, the numbers of the model, floats first, and the
+    tolerance.
+
+    - `movable`, `structures`, `rest`, `settings`, `unchecked`: as for `EventTime`, the horizon among the movable leaves.
+    - `starts`: the leaves that are components of the start.
+    - `is_driven`: whether the period is given; `free`: the components that may change; `symmetry`: as for `periodic_orbit`.
+    - `with_multipliers`: whether the derivatives of the multipliers are computed.
+    """
+
+    movable: int
+    structures: tuple[Any, Any] = eqx.field(static=True)
+    rest: PyTree
+    settings: Settings
+    unchecked: bool = eqx.field(static=True)
+    starts: tuple[int, ...] = eqx.field(static=True)
+    is_driven: bool = eqx.field(static=True)
+    free: tuple[int, ...] = eqx.field(static=True)
+    symmetry: Any = eqx.field(static=True)
+    with_multipliers: bool = eqx.field(static=True, default=True)
+
+    @classmethod
+    def of(cls, model: AbstractModel, t1: Array, settings: Settings, *options: Any) -> tuple[Any, ...]:
+        """The solve and its leaves. **Arguments:** `options`: the fields from `is_driven` on."""
+        unchecked = is_traced((model, t1, settings.tolerance))
+        floats, rest = eqx.partition(model, eqx.is_inexact_array)
+        others, rest = eqx.partition(rest, eqx.is_array)
+        numbers, further = (jax.tree.flatten(part) for part in (floats, others))
+        structures = (numbers[1], further[1])
+        pairs = zip(model.parameters.names, model.parameters.values, strict=True)
+        names = [name for name, value in pairs if eqx.is_inexact_array(value)]
+        starts = tuple(k for k, name in enumerate(names, 1) if name.startswith("start"))
+        solve = cls(1 + len(numbers[0]), structures, rest, settings.with_tolerance(None), unchecked, starts, *options)
+        return (solve, t1, *numbers[0], *further[0], settings.tolerance)
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.zeros(jnp.shape(value), bool)
+
+    def for_parts(self, wanted: tuple[int, ...]) -> "OrbitSolve":
+        # The real and the imaginary parts of the multipliers.
+        return dataclasses.replace(
+            self, with_multipliers=any(part % PARTS in (2, 3) for part in wanted if part >= PARTS)
+        )
+
+    def model(self, leaves: Sequence[Array]) -> AbstractModel:
+        """The model of the leaves."""
+        parts = zip(self.structures, (leaves[1 : self.movable], leaves[self.movable : -1]), strict=True)
+        return eqx.combine(*(jax.tree.unflatten(structure, part) for structure, part in parts), self.rest)
+
+    def with_start(self, leaves: Sequence[Array], state: Float[Array, "components cells"]) -> tuple[Array, ...]:
+        """The leaves with other starts."""
+        moved = list(leaves)
+        for k, component in zip(self.starts, state, strict=True):
+            moved[k] = component
+        return tuple(moved)
+
+    def components(self, leaves: Sequence[Array], rows: Float[Array, "rows cells"], mapped: bool = True) -> Array:
+        """States of the engine in the components of a start, (components, cells), by default mapped by the symmetry."""
+        model = self.model(leaves)
+        parts = model.read(tuple(model.quantities), jnp.asarray(jnp.nan), rows, None)
+        state = jnp.stack([parts[name] for name in model.quantities])
+        return state if self.symmetry is None or not mapped else jax.vmap(self.symmetry, -1, -1)(state)
+
+    def at_section(self, mode: VariationalMode, state: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """By how much the end of a run in a mode is too early [s], and the state at the section, with their variations."""
+        primal, *variations = mode.parts(state)
+        numbers, build = mode.active_numbers()
+
+        def moved(primal: Array, begin: Array, *numbers: Array) -> tuple[Array, Array]:
+            problem, zero = build(*numbers).problem(primal), jnp.zeros_like(begin)
+            rates = problem.field(zero, primal)
+            if self.is_driven:
+                # If the mode begins later, the state has advanced less.
+                return zero, primal - begin * rates
+            value, rate = jax.lax.stop_gradient(jax.jvp(problem.event_function, (primal,), (rates,)))
+            shift = -value / jnp.where(rate == 0.0, jnp.inf, rate) + delay(problem.event_function, primal, rates)
+            return begin + shift, primal + shift * rates
+
+        point = (primal[:-1], jnp.zeros_like(primal[-1]), *numbers)
+        directions = mode.directions([part[:-1] for part in variations], [part[-1] for part in variations])
+        return along(moved, point, directions)
+
+    def returned(
+        self, leaves: tuple[Array, ...], cells: int, others: tuple[int, ...], tolerance: Array, left: Array
+    ) -> Return:
+        """The next return of every cell.
+
+        **Arguments:** `others`: the leaves of the model, apart from the start, along which to differentiate; `left`: horizon
+        [s], 0 for cells that are not run.
+        """
+        active, settings = (*self.starts, *others), self.settings.with_tolerance(tolerance)
+
+        def build(leaves: tuple[Array, ...], cells: int | None) -> Ensemble:
+            assert cells is not None
+            return Ensemble(None, *self.model(leaves).modes(cells, tolerance, (), False), 1, False)
+
+        ensemble, tangents, gather = tangents_by(build, active, leaves, cells)
+        pairs = tuple((tangent.modes, tangent.states) for tangent in tangents)
+        modes = variational_modes(ensemble.modes, pairs, tolerance, not self.is_driven)
+        start, size = variational_start(ensemble.states, pairs), len(ensemble.states)
+        options = {"counters": 2, "n_blocks": 1 + len(pairs), "traced": True}
+        ended = solve_hybrid(modes, ensemble.first, start, left, cells, settings, **options)
+        rows = jnp.reshape(ended.state, (1 + len(pairs), size + 1, cells))
+        # A run that has ended at a reset which jumps over the zero is in no mode.
+        time, point, slopes, mode = jnp.zeros(cells), rows[0, :size], rows[1:], ended.mode % len(modes)
+        rate, in_motion = jnp.zeros_like(point), jnp.zeros(cells, bool)
+        for number, of_mode in enumerate(modes):
+            is_here, primal = ended.mode == number, of_mode.parts(ended.state)[0]
+            (shift, moved), (delays, changes) = self.at_section(of_mode, ended.state)
+            problem = of_mode.mode.problem(primal[:-1])
+            if of_mode.mode.margins and not self.is_driven:
+                at_reset = is_here & on_margin(problem, ended.end_time, primal[:-1])
+                mode_and_tangents = (of_mode.mode, *of_mode.tangents)
+                through, *by = (dataclasses.replace(part, continues=True) for part in mode_and_tangents)
+                onward = dataclasses.replace(of_mode, mode=through, tangents=tuple(by))
+                transition = onward.reset_map(ended.state, jnp.full(cells, jnp.inf))
+                after = jnp.reshape(transition.state, rows.shape)
+                point, slopes = jnp.where(at_reset, after[0, :size], point), jnp.where(at_reset, after[1:], slopes)
+                mode, is_here = jnp.where(at_reset, transition.mode, mode), is_here & ~at_reset
+            in_motion |= is_here
+            time, point = jnp.where(is_here, shift, time), jnp.where(is_here, moved, point)
+            rate = jnp.where(is_here, problem.field(jnp.zeros(cells), primal[:-1]), rate)
+            slopes = jnp.where(is_here, jnp.concatenate([changes, delays[:, None]], axis=1), slopes)
+        slopes = jnp.where(ended.counts[-1] > 0, jnp.nan, slopes)
+        gathered = gather([(slope[-1], jnp.moveaxis(slope[:size], -1, 0)) for slope in slopes])
+        point, changes, rate = self._in_components(leaves, active, point, [by[1].T for by in gathered], rate)
+        count, delays = len(self.starts), [by[0] for by in gathered]
+        has_returned = ended.status == (REACHED_END if self.is_driven else CROSSED)
+        by_state, time_by_state = jnp.stack(changes[:count], axis=-1), jnp.stack(delays[:count], axis=-1)
+        derivatives = (by_state, time_by_state, changes[count:], delays[count:])
+        return Return(ended.end_time + time, point, rate, *derivatives, in_motion, has_returned, mode == ensemble.first)
+
+    def _in_components(
+        self, leaves: tuple[Array, ...], active: tuple[int, ...], point: Array, changes: list[Array], rate: Array
+    ) -> tuple[Array, list[Array], Array]:
+        """The state of a return in components, its derivative by each active leaf, (cells, components), and its rate."""
+
+        def read(point: Array, *moving: Array) -> Array:
+            values = list(leaves)
+            for k, leaf in zip(active, moving, strict=True):
+                values[k] = leaf
+            return self.components(values, point)
+
+        moving = [jnp.broadcast_to(leaves[k], point.shape[1:]) for k in active]
+        still = [jnp.zeros_like(leaf) for leaf in moving]
+        state, push = jax.linearize(read, point, *moving)
+        units = [[*still[:k], jnp.ones_like(leaf), *still[k + 1 :]] for k, leaf in enumerate(moving)]
+        slopes = [push(change, *unit).T for change, unit in zip(changes, units, strict=True)]
+        return state, slopes, push(rate, *still)
+
+    def on_section(self, leaves: tuple[Array, ...], cells: int, tolerance: Array, state: Array) -> tuple[Array, Array]:
+        """States moved along the motion onto a section nearby, and by how much [s]."""
+        total = jnp.zeros(cells)
+        for _ in range(3):
+            moved = self.with_start(leaves, state)
+            modes, first, states = self.model(moved).modes(cells, tolerance, (), False)
+            for number, mode in enumerate(modes):
+                problem = mode.problem(states)
+                rates = problem.field(jnp.zeros(cells), states)
+                value, rate = jax.jvp(problem.event_function, (states,), (rates,))
+                shift = jnp.where(first == number, -value / jnp.where(rate == 0.0, jnp.inf, rate), 0.0)
+                states, total = states + shift * rates, total + shift
+            state = self.components(moved, states, mapped=False)
+        return state, total
+
+    def newton(self, cells: int, leaves: tuple[Array, ...]) -> Newton:
+        """Newton's iteration of all cells, from the starts."""
+        is_legal, t1, tolerance = legal_run(
+            self.model(leaves).legal() if self.unchecked else True, leaves[0], leaves[-1]
+        )
+        tolerance = jnp.min(tolerance)
+        finer = jnp.maximum(tolerance / FINER, TIGHTEST)
+        size, free = len(self.starts), jnp.asarray(self.free)
+        start = jnp.stack([jnp.broadcast_to(leaves[k], (cells,)) for k in self.starts])
+
+        def step(old: Newton) -> Newton:
+            is_bad, state = old.reason > 0, old.state
+            tolerance_now = jnp.where(old.is_done, finer, tolerance)
+            moved, shift = state, jnp.zeros(cells)
+            if not self.is_driven:
+                moved, shift = self.on_section(leaves, cells, tolerance, state)
+                state = jnp.where(old.in_motion & ~is_bad, moved, state)
+            left = jnp.where(is_bad, 0.0, t1)
+            new = self.returned(self.with_start(leaves, state), cells, (), tolerance_now, left)
+            miss = new.state - state
+            matrix = (jnp.eye(size) - new.by_state)[:, :, free]
+            is_sound = jnp.isfinite(matrix).all(axis=(1, 2)) & jnp.isfinite(miss).all(axis=0)
+            left_vectors, values, right_vectors = jnp.linalg.svd(
+                jnp.where(is_sound[:, None, None], matrix, jnp.eye(size)[:, free]), full_matrices=False
+            )
+            is_own = values > RANK * values[:, :1]
+            factors = jnp.where(is_own, 1.0 / jnp.where(is_own, values, 1.0), 0.0)
+            inverse = jnp.einsum("ckf,ck,cnk->cfn", right_vectors, factors, left_vectors)
+            change = jnp.zeros_like(state).at[free].set(jnp.einsum("cfn,nc->fc", inverse, miss))
+            # A guess is moved onto the section, unless the section is at a reset.
+            settles = (old.count == 0) & new.in_motion & (not self.is_driven)
+            settled = jnp.where(jnp.abs(shift) < NEAR * new.time, moved, new.state)
+            scale = jnp.maximum(1.0, jnp.max(jnp.abs(state), axis=0))
+            residual = jnp.max(jnp.abs(miss), axis=0)
+            converged = ~settles & (residual <= CONVERGED * tolerance * scale)
+            reason = jnp.where(is_sound, 0, 3)
+            reason = jnp.where(~converged & (old.count >= MOST_NEWTON), 3, reason)
+            reason = jnp.where(new.is_home, reason, 2)
+            reason = jnp.where(is_bad, old.reason, jnp.where(new.has_returned, reason, 1))
+            following = jnp.where(settles, settled, state + change)
+            return Newton(
+                old.count + 1,
+                jnp.where(reason > 0, state, following),
+                jnp.all(converged | (reason > 0)),
+                old.is_done,
+                reason,
+                old.iterations + (reason == 0),
+                new.in_motion,
+                new.time + jnp.einsum("cn,nc->c", new.time_by_state, change),
+                new.by_state,
+                new.time_by_state,
+                inverse,
+                jnp.sum(is_own, axis=1),
+                residual,
+                jnp.max(jnp.abs(change), axis=0),
+            )
+
+        false, zeros, whole = jnp.asarray(False), jnp.zeros(cells), jnp.zeros(cells, int)
+        reason = jnp.where(is_legal, whole, len(REASONS) - 1)
+        matrices = (jnp.zeros((cells, size, size)), jnp.zeros((cells, size)), jnp.zeros((cells, len(self.free), size)))
+        of_last = (jnp.zeros(cells, bool), zeros, *matrices, whole, zeros, zeros)
+        begin = Newton(jnp.zeros((), int), start, false, false, reason, whole, *of_last)
+        return jax.lax.while_loop(lambda newton: ~newton.is_finished, step, begin)
+
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> tuple[Array, ...]:
+        return self.parts_of(self.newton(cells, leaves))
+
+    def parts_of(self, found: Newton) -> tuple[Array, ...]:
+        """The parts of the primal."""
+        values = jnp.linalg.eigvals(found.by_state)
+        order = jnp.argsort(-jnp.abs(values), axis=-1)
+        values = jnp.take_along_axis(values, order, axis=-1)[:, : len(self.starts) - (not self.is_driven)]
+        bound = jnp.maximum(SAFETY * found.step, 1e-14 * jnp.max(jnp.abs(found.state), axis=0))
+        counts = (len(self.free) - found.rank, found.iterations, found.reason)
+        orbit = (found.time, found.state.T, values.real, values.imag, bound, found.residual)
+        return (*nan_unless(found.reason == 0, orbit), *(count.astype(float) for count in counts))
+
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[tuple[Array, ...], list[Any]]:
+        if nested:
+            raise ValueError("second derivatives of periodic orbits are not available; take differences of a gradient")
+        found, size, free = self.newton(cells, leaves), len(self.starts), jnp.asarray(self.free)
+        others = tuple(k for k in active if k > 0 and k not in self.starts)
+        at_orbit = self.with_start(leaves, found.state)
+        t1 = jnp.where(found.reason > 0, 0.0, leaves[0])
+        finer = jnp.maximum(jnp.min(leaves[-1]) / FINER, TIGHTEST)
+        last = self.returned(at_orbit, cells, others, finer, t1)
+        by_numbers = dict(zip(others, zip(last.by_numbers, last.time_by_numbers, strict=True), strict=True))
+        zeros, changes = jnp.zeros((cells, size)), {}
+        for k in active:
+            fixed, (by, delay) = zeros, by_numbers.get(k, (zeros, jnp.zeros(cells)))
+            if k == 0 and self.is_driven:
+                by, delay = last.rate.T, jnp.ones(cells)
+            elif k in self.starts and self.starts.index(k) not in self.free:
+                fixed = fixed.at[:, self.starts.index(k)].set(1.0)
+                by = jnp.einsum("cij,cj->ci", last.by_state, fixed) - fixed
+            change = fixed.at[:, free].add(jnp.einsum("cfn,cn->cf", found.inverse, by))
+            changes[k] = (delay + jnp.einsum("cn,cn->c", last.time_by_state, change), change)
+        values = self.parts_of(found)
+        multipliers = [(None, None)] * len(active)
+        if self.with_multipliers:
+            multipliers = self._multiplier_slopes(active, cells, at_orbit, values[2] + 1j * values[3], changes)
+        slopes = [(*changes[k], *pair, *[None] * (PARTS - 4)) for k, pair in zip(active, multipliers, strict=True)]
+        return values, slopes
+
+    def _multiplier_slopes(
+        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], values: Array, changes: dict[int, Any]
+    ) -> list[tuple[Array, Array]]:
+        """The derivatives of the multipliers by each active leaf, from orbits for neighbouring values of the leaf."""
+        count, moved = len(STENCIL) * len(active), []
+        for k, leaf in enumerate(leaves):
+            blocks = jnp.broadcast_to(leaf, (len(active), len(STENCIL), cells))
+            for row, number in enumerate(active):
+                size = STENCIL_STEP * tangent_scale(leaves[number])
+                by = 1.0 if k == number else changes[number][1][:, self.starts.index(k)] if k in self.starts else 0.0
+                if k in self.starts and k == number:
+                    by = changes[number][1][:, self.starts.index(k)]
+                steps = [place * size * by for place, _ in STENCIL]
+                blocks = blocks.at[row].add(jnp.stack([jnp.broadcast_to(step, (cells,)) for step in steps]))
+            moved.append(blocks.reshape(-1))
+        parts = self.parts_of(self.newton(count * cells, tuple(moved)))
+        near = (parts[2] + 1j * parts[3]).reshape(len(active), len(STENCIL), cells, -1)
+        # The multipliers in the order of those of the orbit.
+        places = jnp.argmin(jnp.abs(near[..., None, :] - values[:, :, None]), axis=-1)
+        near = jnp.take_along_axis(near, places, axis=-1)
+        weights = jnp.array([weight for _, weight in STENCIL])
+        slopes = []
+        for row, number in enumerate(active):
+            size = jnp.broadcast_to(STENCIL_STEP * tangent_scale(leaves[number]), (cells,))
+            slope = jnp.einsum("s,scm->cm", weights, near[row]) / (12.0 * size[:, None])
+            slopes.append((slope.real, slope.imag))
+        return slopes
+
+
+@status_line("looking for a periodic orbit")
+def periodic_orbit(
+    system: object,
+    start: object,
+    event: Callable[..., Any] | None = None,
+    *,
+    period: Float[ArrayLike, ""] | None = None,
+    free: Sequence[str] | None = None,
+    symmetry: Callable[[Array], Array] | None = None,
+    direction: str = "fall",
+    t1: float = 1000.0,
+    tolerance: float = 1e-10,
+    solver: diffrax.AbstractERK | None = None,
+) -> Any:
+    """A periodic orbit of your own system, by Newton's method on its return map; works under `jit`, `vmap`, `grad` and `jvp`.
+
+    The return map leads from a state to the state at the next crossing of a section, where an event function falls through
+    zero, or after a given period. If the section is at a reset, the state is that after the reset. The map's Jacobian is exact,
+    also through resets. The derivatives of the period, the state and the multipliers with respect to every parameter use the
+    implicit function theorem; those of the multipliers are differences of exact derivatives at neighbouring orbits, with about
+    eight correct digits.
+
+    If a quantity is conserved or the motion can be shifted, orbits form families, and Newton's method takes the shortest step,
+    to an orbit of the family near the guess.
+
+    **Arguments:**
+
+    - `system`: your own system, a `Hybrid` or an `AbstractSystem`. Scenes are not available; `crossings` runs them.
+    - `start`: a guess of a state on the orbit, near the section, in the first mode. Several guesses have the shape
+      (guesses, components), or twice (guesses, coordinates) for an `AbstractSystem`.
+    - `event`, `direction`: the section, as for `crossings`; by default the event of the `Hybrid`.
+    - `period`: the period [s] of a driven system, in place of a section. The drive begins at time 0.
+    - `free`: names of the components that Newton's method changes, such as `["y0"]`; by default all.
+    - `symmetry`: function of the state at a return that maps it to the start of the next period, for orbits that repeat up to a
+      shift or a reflection.
+    - `t1`: longest time [s] until a return.
+    - `tolerance`: relative tolerance of the integration; that of the last step is a hundredth of it.
+    - `solver`: as for `event_time`.
+
+    **Returns:** an `Orbit`; for several guesses a list of the distinct orbits, without the guesses that led to none. Inside a
+    transformation, numbers are NaN and `reason` is positive if there is no orbit.
+
+    **Raises:** `ValueError` if Newton's method finds no orbit, with the reason; for arguments out of range, a section of a
+    system whose functions depend on time, and second derivatives.
+
+    **Example:** the limit cycle of van der Pol's oscillator.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Oscillator(nonholonomic.AbstractMode):
+    ...     mu: float
+    ...
+    ...     def field(self, t, y):
+    ...         return jnp.array([y[1], self.mu * (1.0 - y[0] ** 2) * y[1] - y[0]])
+    >>> def section(t, y):
+    ...     return y[1]
+    >>> orbit = nonholonomic.periodic_orbit(nonholonomic.Hybrid([Oscillator(1.0)]), [2.0, 0.0], section)
+    >>> print(f"{orbit.period:.8f} s, {orbit.state[0]:.8f}, {orbit.multipliers[0].real:.6f}, {orbit.stable}")
+    6.66328686 s, 2.00861986, 0.000860, True
+
+    ```
+    """
+    if period is not None and event is not None:
+        raise ValueError("event and period: pass the section or the period of a drive, not both")
+    model = model_of(system, start, section_of(event, direction, "after"))
+    if not hasattr(model, "form"):
+        raise ValueError("system: periodic_orbit needs a Hybrid or an AbstractSystem; crossings runs scenes")
+    if period is None:
+        require_event(model)
+        if model.form.traits.depends_on_time:
+            raise ValueError(
+                "event: functions of the system depend on time; pass period=, that of the drive, in place of event="
+            )
+    else:
+        model = model.without_event()
+    t1 = t1 if period is None else period
+    check_run(model, t1, tolerance)
+    names = tuple(model.quantities)
+    unknown = [name for name in free or () if name not in names]
+    if unknown or (free is not None and (isinstance(free, str) or not len(free))):
+        raise ValueError(f"free = {shown(free)} must be a list of some of {', '.join(names)}")
+    places = tuple(k for k, name in enumerate(names) if free is None or name in free)
+    options = (period is not None, places, symmetry)
+    settings = settings_for_lanes(tolerance, solver)
+    time, state, *parts = differentiable_solve(*OrbitSolve.of(model, as_number(t1), settings, *options))
+    real, imaginary, error, residual, *counts = parts
+    family, iterations, reason = (jnp.asarray(count).astype(int) for count in counts)
+    orbit = Orbit(time, state, real + 1j * imaginary, error, residual, family, iterations, reason, names)
+    if not is_traced(reason) and np.ndim(reason) == 0 and int(reason):
+        why = REASONS[int(reason)].format(t1=float(t1), residual=float(residual), steps=int(iterations))
+        raise ValueError(f"start: no periodic orbit was found: after {int(iterations)} Newton steps, {why}")
+    return orbit
