@@ -23,7 +23,7 @@ from ..integration import Settings
 from ..integration.problem import CROSSED, REACHED_END, TIGHTEST, legal_run
 from ..terminal import status_line
 from ..text import shown
-from ..validation import as_number, is_traced, nan_unless
+from ..validation import as_number, is_traced, require_outside
 from .crossings import on_margin, section_of
 from .event import Ensemble
 from .model import AbstractModel, check_run, model_of, require_event, settings_for_lanes
@@ -42,6 +42,9 @@ STENCIL, STENCIL_STEP = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0)), 1e
 
 #: Ratio of the error bound to the last Newton step.
 SAFETY = 5.0
+
+#: Orbits whose periods and states differ by less than this are the same.
+SAME_ORBIT = 1e-6
 
 #: The number of parts of an orbit.
 PARTS = 9
@@ -227,7 +230,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
         return state if self.symmetry is None or not mapped else jax.vmap(self.symmetry, -1, -1)(state)
 
     def at_section(self, mode: VariationalMode, state: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """By how much the end of a run in a mode is too early [s], and the state at the section, with their variations."""
+        """By how much runs in a mode end before the section [s], and the states at the section, with their variations."""
         primal, *variations = mode.parts(state)
         numbers, build = mode.active_numbers()
 
@@ -267,23 +270,23 @@ class OrbitSolve(AbstractDifferentiableSolve):
         ended = solve_hybrid(modes, ensemble.first, start, left, cells, settings, **options)
         rows = jnp.reshape(ended.state, (1 + len(pairs), size + 1, cells))
         # A run that has ended at a reset which jumps over the zero is in no mode.
-        time, point, slopes, mode = jnp.zeros(cells), rows[0, :size], rows[1:], ended.mode % len(modes)
+        point, slopes, mode = rows[0, :size], rows[1:], ended.mode % len(modes)
         rate, in_motion = jnp.zeros_like(point), jnp.zeros(cells, bool)
         for number, of_mode in enumerate(modes):
             is_here, primal = ended.mode == number, of_mode.parts(ended.state)[0]
-            (shift, moved), (delays, changes) = self.at_section(of_mode, ended.state)
+            (_, moved), (delays, changes) = self.at_section(of_mode, ended.state)
             problem = of_mode.mode.problem(primal[:-1])
             if of_mode.mode.margins and not self.is_driven:
                 at_reset = is_here & on_margin(problem, ended.end_time, primal[:-1])
                 mode_and_tangents = (of_mode.mode, *of_mode.tangents)
                 through, *by = (dataclasses.replace(part, continues=True) for part in mode_and_tangents)
                 onward = dataclasses.replace(of_mode, mode=through, tangents=tuple(by))
-                transition = onward.reset_map(ended.state, jnp.full(cells, jnp.inf))
+                transition = onward.reset_map(ended.state.at[:size].set(moved), jnp.full(cells, jnp.inf))
                 after = jnp.reshape(transition.state, rows.shape)
                 point, slopes = jnp.where(at_reset, after[0, :size], point), jnp.where(at_reset, after[1:], slopes)
                 mode, is_here = jnp.where(at_reset, transition.mode, mode), is_here & ~at_reset
             in_motion |= is_here
-            time, point = jnp.where(is_here, shift, time), jnp.where(is_here, moved, point)
+            point = jnp.where(is_here, moved, point)
             rate = jnp.where(is_here, problem.field(jnp.zeros(cells), primal[:-1]), rate)
             slopes = jnp.where(is_here, jnp.concatenate([changes, delays[:, None]], axis=1), slopes)
         slopes = jnp.where(ended.counts[-1] > 0, jnp.nan, slopes)
@@ -293,7 +296,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
         has_returned = ended.status == (REACHED_END if self.is_driven else CROSSED)
         by_state, time_by_state = jnp.stack(changes[:count], axis=-1), jnp.stack(delays[:count], axis=-1)
         derivatives = (by_state, time_by_state, changes[count:], delays[count:])
-        return Return(ended.end_time + time, point, rate, *derivatives, in_motion, has_returned, mode == ensemble.first)
+        time = ended.end_time if self.is_driven else ended.crossing_time
+        return Return(time, point, rate, *derivatives, in_motion, has_returned, mode == ensemble.first)
 
     def _in_components(
         self, leaves: tuple[Array, ...], active: tuple[int, ...], point: Array, changes: list[Array], rate: Array
@@ -342,7 +346,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
             is_bad, state = old.reason > 0, old.state
             tolerance_now = jnp.where(old.is_done, finer, tolerance)
             moved, shift = state, jnp.zeros(cells)
-            if not self.is_driven:
+            if not self.is_driven and self.symmetry is None:
                 moved, shift = self.on_section(leaves, cells, tolerance, state)
                 state = jnp.where(old.in_motion & ~is_bad, moved, state)
             left = jnp.where(is_bad, 0.0, t1)
@@ -359,7 +363,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
             change = jnp.zeros_like(state).at[free].set(jnp.einsum("cfn,nc->fc", inverse, miss))
             # A guess is moved onto the section, unless the section is at a reset.
             settles = (old.count == 0) & new.in_motion & (not self.is_driven)
-            settled = jnp.where(jnp.abs(shift) < NEAR * new.time, moved, new.state)
+            is_near = (jnp.abs(shift) < NEAR * new.time) & (self.symmetry is None)
+            settled = jnp.where(is_near, moved, new.state)
             scale = jnp.maximum(1.0, jnp.max(jnp.abs(state), axis=0))
             residual = jnp.max(jnp.abs(miss), axis=0)
             converged = ~settles & (residual <= CONVERGED * tolerance * scale)
@@ -403,7 +408,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
         bound = jnp.maximum(SAFETY * found.step, 1e-14 * jnp.max(jnp.abs(found.state), axis=0))
         counts = (len(self.free) - found.rank, found.iterations, found.reason)
         orbit = (found.time, found.state.T, values.real, values.imag, bound, found.residual)
-        return (*nan_unless(found.reason == 0, orbit), *(count.astype(float) for count in counts))
+        is_bad = found.reason > 0
+        orbit = [jnp.where(is_bad.reshape(-1, *[1] * (part.ndim - 1)), jnp.nan, part) for part in orbit]
+        return (*orbit, *(count.astype(float) for count in counts))
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
@@ -461,6 +468,27 @@ class OrbitSolve(AbstractDifferentiableSolve):
             slope = jnp.einsum("s,scm->cm", weights, near[row]) / (12.0 * size[:, None])
             slopes.append((slope.real, slope.imag))
         return slopes
+
+
+def is_several(start: Any) -> bool:
+    """Whether a start consists of several guesses."""
+    is_pair = isinstance(start, tuple) and len(start) == 2 and all(np.ndim(part) == 2 for part in start)
+    return is_pair or (not isinstance(start, tuple) and np.ndim(start) == 2)
+
+
+def distinct_orbits(system: object, guesses: Any, event: Any, options: dict[str, Any]) -> list[Orbit]:
+    """The distinct orbits that several guesses lead to, in the order of the guesses."""
+    require_outside((system, guesses), "periodic_orbit of several guesses", "jax.vmap of periodic_orbit")
+    guesses = jax.tree.map(as_number, guesses if isinstance(guesses, tuple) else jnp.asarray(guesses, float))
+    found = jax.vmap(lambda guess: periodic_orbit(system, guess, event, **options))(guesses)
+    orbits: list[Orbit] = []
+    for k in np.flatnonzero(np.asarray(found.reason) == 0):
+        orbit = jax.tree.map(lambda part, k=k: part[k], found)
+        values = np.append(orbit.state, orbit.period)
+        others = [np.append(other.state, other.period) for other in orbits]
+        if not any(np.allclose(values, other, SAME_ORBIT, SAME_ORBIT) for other in others):
+            orbits.append(orbit)
+    return orbits
 
 
 @status_line("looking for a periodic orbit")
@@ -528,6 +556,9 @@ def periodic_orbit(
     """
     if period is not None and event is not None:
         raise ValueError("event and period: pass the section or the period of a drive, not both")
+    if is_several(start):
+        options = {"free": free, "symmetry": symmetry, "direction": direction, "t1": t1, "tolerance": tolerance}
+        return distinct_orbits(system, start, event, options | {"period": period, "solver": solver})
     model = model_of(system, start, section_of(event, direction, "after"))
     if not hasattr(model, "form"):
         raise ValueError("system: periodic_orbit needs a Hybrid or an AbstractSystem; crossings runs scenes")

@@ -1,0 +1,131 @@
+"""Crossings of a section against closed forms, and against the first event of a table."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from own_modes import GRAVITY, Ball, bounce
+
+import nonholonomic
+import stroller
+import tippe
+from nonholonomic import AbstractMode, Hybrid, crossings, event_time, sweep
+
+
+class Spring(AbstractMode):
+    damping: float
+
+    def field(self, t, y):
+        return jnp.array([y[1], -y[0] - self.damping * y[1]])
+
+
+def middle(t, y):
+    return y[0]
+
+
+def middle_or_later(t, y):
+    return jnp.where(t < 0.0, 1.0, y[0])
+
+
+def test_returns_of_a_damped_spring():
+    damping = np.array([0.0, 0.1, 0.4])
+    options = {"axes": {"damping": damping}, "progress": False, "tolerance": 1e-11}
+    spring = Hybrid([Spring(0.1)])
+    table = crossings(spring, [1.0, 0.0], 40.0, middle, count=4, skip=1, **options)
+    rate = np.sqrt(1.0 - 0.25 * damping**2)
+    first = np.arccos(0.5 * damping * -1.0)
+    turns = np.arange(2, 6)
+    times = ((np.pi - np.arccos(0.5 * damping))[:, None] + 2.0 * np.pi * (turns - 1)) / rate[:, None]
+    np.testing.assert_allclose(times[:, 0], (first + 2.0 * np.pi) / rate)
+    np.testing.assert_allclose(table.time, times, atol=1e-9)
+    np.testing.assert_allclose(table.y0, 0.0, atol=1e-14)
+    np.testing.assert_allclose(table.y1, -np.exp(-0.5 * damping[:, None] * times), rtol=1e-9)
+    np.testing.assert_array_equal(table.crossing, turns)
+    assert table.dims("y1") == ("damping", "crossing")
+    assert set(table.status.ravel()) == {"event"}
+    np.testing.assert_allclose(table.end_time, table.time[:, -1], atol=1e-9)
+    # No more steps than those of runs through the event to the same horizon.
+    last = sweep(spring, [1.0, 0.0], 40.0, event=middle, crossing="last", **options)
+    assert (table.steps <= last.steps).all()
+    # With a clock in the state, and for rises.
+    rises = crossings(spring, [1.0, 0.0], 12.0, middle_or_later, count=3, direction="rise", **options)
+    np.testing.assert_allclose(rises.time[:, :2], times[:, :2] - (np.pi / rate)[:, None], atol=1e-9)
+    assert np.isnan(rises.time[:, 2]).all()
+    assert np.isnan(rises.y1[:, 2]).all()
+    assert set(rises.status.ravel()) == {"completed"}
+
+
+def ground(t, y):
+    return y[0]
+
+
+def highest(t, y):
+    return y[1]
+
+
+@pytest.mark.parametrize("side", ["before", "after"])
+def test_crossings_at_resets(side):
+    table = crossings(Hybrid([Ball()]), [1.0, 0.0, 0.0], 9.0, ground, count=4, skip=1, side=side, progress=False)
+    np.testing.assert_allclose(table.time, [bounce(1.0, 0.8, GRAVITY, k) for k in range(2, 6)], atol=1e-12)
+    speed = np.sqrt(2.0 * GRAVITY) * 0.8 ** np.arange(1, 5)
+    np.testing.assert_allclose(table.y1, -speed if side == "before" else 0.8 * speed, rtol=1e-11)
+    np.testing.assert_array_equal(table.y2, np.arange(1, 5) + (side == "after"))
+
+
+def test_crossings_between_resets_in_a_table():
+    """The start at the apex does not count."""
+    restitution = [0.5, 0.8]
+    table = crossings(
+        Hybrid([Ball()]), [1.0, 0.0, 0.0], 3.0, highest, count=5, axes={"restitution": restitution}, progress=False
+    )
+    for row, e in enumerate(restitution):
+        bounces = np.array([bounce(1.0, e, GRAVITY, k) for k in range(1, 6)])
+        times = bounces + np.sqrt(2.0 / GRAVITY) * e ** np.arange(1, 6)
+        times[times > 3.0] = np.nan
+        np.testing.assert_allclose(table.time[row], times, atol=1e-11)
+        np.testing.assert_allclose(
+            table.y0[row], np.where(np.isnan(times), np.nan, e ** (2 * np.arange(1.0, 6.0))), rtol=1e-11
+        )
+        assert table.status[row] == ("completed" if np.isnan(times).any() else "event")
+
+
+def tilted(t, motion):
+    return 0.3 - motion.theta
+
+
+def slowed(t, motion):
+    return motion.speed - 1.5
+
+
+def test_crossings_of_scenes():
+    top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    scene, launch = tippe.Scene(top, friction=tippe.Viscous(0.3)), tippe.Launch(0.1, 155.0)
+    table = crossings(scene, launch, 4.0, tilted, count=2, quantities=["theta", "axis"], progress=False)
+    np.testing.assert_allclose(table.time[0], event_time(scene, launch, 4.0, tilted), rtol=1e-12)
+    np.testing.assert_allclose(table.theta[0], 0.3, rtol=1e-10)
+    assert table.axis.shape == (2, 3)
+    body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    ride = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    start = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    table = crossings(ride, start, 4.0, slowed, count=2, quantities=["speed"], progress=False)
+    np.testing.assert_allclose(table.time[0], event_time(ride, start, 4.0, slowed), rtol=1e-12)
+    np.testing.assert_allclose(table.speed, [1.5, np.nan], rtol=1e-10)
+    assert table.status == "completed"
+    with pytest.raises(ValueError, match="the section of a scene needs event="):
+        crossings(scene, launch, 4.0)
+
+
+def test_a_file_of_crossings_and_what_is_refused(tmp_path):
+    spring, path = Hybrid([Spring(0.1)]), tmp_path / "crossings.h5"
+    arguments = (spring, [1.0, 0.0], 40.0, middle, 4, 1)
+    options = {"axes": {"damping": [0.0, 0.1, 0.4]}, "progress": False, "tolerance": 1e-11}
+    table = crossings(*arguments, path=path, **options)
+    for again in (crossings(*arguments, path=path, **options), nonholonomic.Table.load(path)):
+        np.testing.assert_array_equal(again.time, table.time)
+    with pytest.raises(ValueError, match="direction = 'up' must be 'fall' or 'rise'"):
+        crossings(*arguments, direction="up")
+    with pytest.raises(ValueError, match="side = 'both' must be 'before' or 'after'"):
+        crossings(*arguments, side="both")
+    with pytest.raises(ValueError, match="count"):
+        crossings(spring, [1.0, 0.0], 40.0, middle, 0)
+    with pytest.raises(ValueError, match="quantities: 'y5'"):
+        crossings(*arguments, quantities=["y5"])

@@ -1,0 +1,241 @@
+"""Periodic orbits against closed forms and published values."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from own_modes import GRAVITY
+from scipy.special import ellipk
+
+from nonholonomic import AbstractMode, AbstractSystem, Hybrid, periodic_orbit
+
+
+class Kicked(AbstractMode):
+    """A spring with negative damping against a wall at its middle, which returns a part of the speed and adds a kick."""
+
+    growth: float
+    restitution: float
+    kick: float = 0.3
+
+    def field(self, t, y):
+        return jnp.array([y[1], 2.0 * self.growth * y[1] - y[0]])
+
+    def margin(self, t, y):
+        return y[0]
+
+    def reset(self, t, y):
+        return jnp.array([0.0, self.kick - self.restitution * y[1]]), 0
+
+
+def wall(t, y):
+    return y[0]
+
+
+def kicked(growth, restitution):
+    """Period, speed after the wall and multiplier: half a turn multiplies the speed by exp(growth T)."""
+    period = jnp.pi / jnp.sqrt(1.0 - growth**2)
+    multiplier = restitution * jnp.exp(growth * period)
+    return jnp.array([period, 0.3 / (1.0 - multiplier), multiplier])
+
+
+def found(growth, restitution):
+    orbit = periodic_orbit(Hybrid([Kicked(growth, restitution)]), [0.0, 0.8], wall)
+    return jnp.array([orbit.period, orbit.state[1], orbit.multipliers[0].real])
+
+
+def test_an_orbit_through_a_reset_and_its_derivatives():
+    values, expected = found(0.1, 0.4), kicked(0.1, 0.4)
+    np.testing.assert_allclose(values, expected, rtol=1e-11)
+    slopes = jax.jit(jax.jacrev(found, (0, 1)))(0.1, 0.4)
+    np.testing.assert_allclose(slopes, jax.jacfwd(kicked, (0, 1))(0.1, 0.4), rtol=1e-8)
+    # In a batch.
+    restitutions = jnp.array([0.3, 0.4])
+    batch = jax.vmap(lambda restitution: found(0.1, restitution))(restitutions)
+    np.testing.assert_allclose(batch, [kicked(0.1, one) for one in restitutions], rtol=1e-11)
+
+
+class Walker(AbstractMode):
+    """The simplest walker: angles of the stance leg and of the hip, and their rates (Garcia et al. 1998)."""
+
+    slope: float
+
+    def field(self, t, y):
+        theta, phi, theta_rate, phi_rate = y
+        acceleration = jnp.sin(theta - self.slope)
+        swing = acceleration + (theta_rate**2 - jnp.cos(theta - self.slope)) * jnp.sin(phi)
+        return jnp.array([theta_rate, phi_rate, acceleration, swing])
+
+    def margin(self, t, y):
+        return y[1] - 2.0 * y[0]
+
+    def reset(self, t, y):
+        theta, c = y[0], jnp.cos(2.0 * y[0])
+        return jnp.array([-theta, -2.0 * theta, c * y[2], c * (1.0 - c) * y[2]]), 0
+
+
+def heel(t, y):
+    return y[1] - 2.0 * y[0]
+
+
+def test_the_simplest_walker():
+    theta, rate = 0.2, -0.2
+    start = [theta, 2.0 * theta, rate, (1.0 - np.cos(2.0 * theta)) * rate]
+    orbit = periodic_orbit(Hybrid([Walker(0.009)]), start, heel)
+    np.testing.assert_allclose(orbit.state[jnp.array([0, 2])], [0.2003109005443, -0.1998324730050], atol=1e-12)
+    np.testing.assert_allclose(orbit.period, 3.882463752851, atol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers[:2].real, -0.19009984, atol=1e-8)
+    np.testing.assert_allclose(np.abs(orbit.multipliers[:2].imag), 0.55759878, atol=1e-8)
+    assert orbit.stable
+    assert orbit.error < 1e-9
+    assert "stable periodic orbit with a period of 3.88246375285" in repr(orbit)
+
+
+def test_a_period_doubling_of_the_walker():
+    """A multiplier is -1 at the slope 0.0150884379."""
+    start = [0.24, 0.48, -0.24, -0.027]
+    orbit = periodic_orbit(Hybrid([Walker(0.0150884379)]), start, heel)
+    np.testing.assert_allclose(orbit.multipliers[0], -1.0, atol=1e-7)
+
+
+class Driven(AbstractMode):
+    damping: float
+    frequency: float
+
+    def field(self, t, y):
+        return jnp.array([y[1], jnp.cos(self.frequency * t) - y[0] - 2.0 * self.damping * y[1]])
+
+
+def test_a_driven_oscillator_and_its_derivatives_by_the_frequency():
+    def orbit(frequency):
+        period = 2.0 * jnp.pi / frequency
+        orbit = periodic_orbit(Hybrid([Driven(0.2, frequency)]), [0.0, 0.0], period=period)
+        return jnp.append(orbit.state, orbit.multipliers[0].real)
+
+    def exact(frequency):
+        amplitude = 1.0 / (1.0 - frequency**2 + 0.4j * frequency)
+        exponent = (-0.2 + 1j * jnp.sqrt(1.0 - 0.2**2)) * 2.0 * jnp.pi / frequency
+        return jnp.array([amplitude.real, (1j * frequency * amplitude).real, jnp.exp(exponent).real])
+
+    values, slopes = orbit(1.3), jax.jacfwd(orbit)(1.3)
+    np.testing.assert_allclose(values, exact(1.3), atol=1e-12)
+    np.testing.assert_allclose(slopes, jax.jacfwd(exact)(1.3), atol=1e-8)
+
+
+class Table(AbstractMode):
+    """A ball on a vibrating table; the phase of the table is that of the impact half a period after time 0."""
+
+    amplitude: float
+    frequency: float
+    restitution: float
+    phase: float
+
+    def table(self, t):
+        return self.amplitude * jnp.sin(self.frequency * t + self.phase)
+
+    def field(self, t, y):
+        return jnp.array([y[1], -GRAVITY])
+
+    def margin(self, t, y):
+        return y[0] - self.table(t)
+
+    def reset(self, t, y):
+        speed = self.amplitude * self.frequency * jnp.cos(self.frequency * t + self.phase)
+        return jnp.array([self.table(t), (1.0 + self.restitution) * speed - self.restitution * y[1]]), 0
+
+
+def test_a_ball_on_a_vibrating_table():
+    """The exact map of the impacts (phase, speed V) with V = g T / 2 and the speed U = V (1 - e) / (1 + e) of the table has the
+    determinant e^2 and the trace 1 - e + (2 e V - (1 + e) A w^2 T sin(phase)) / (U + V)."""
+    frequency, restitution = 30.0, 0.6
+    period = 2.0 * np.pi / frequency
+    speed = 0.5 * GRAVITY * period
+    of_table = speed * (1.0 - restitution) / (1.0 + restitution)
+    amplitude = 1.2 * of_table / frequency
+    phase = np.arccos(of_table / (amplitude * frequency))
+    drag = (1.0 + restitution) * amplitude * frequency**2 * period * np.sin(phase)
+    trace = 1.0 - restitution + (2.0 * restitution * speed - drag) / (of_table + speed)
+    expected = np.roots([1.0, -trace, restitution**2])
+    system = Hybrid([Table(amplitude, frequency, restitution, phase + np.pi)])
+    apex = amplitude * np.sin(phase) + GRAVITY * period**2 / 8.0
+    orbit = periodic_orbit(system, [apex + 1e-3, 0.01], period=period)
+    np.testing.assert_allclose(orbit.state, [apex, 0.0], atol=1e-11)
+    np.testing.assert_allclose(np.sort_complex(orbit.multipliers), np.sort_complex(expected), atol=1e-8)
+    assert orbit.stable == (max(abs(expected)) < 1.0)
+
+
+class Pendulum(AbstractSystem):
+    length: float = 1.0
+    dimension = 1
+
+    def metric(self, q):
+        return jnp.array([[self.length**2]])
+
+    def potential(self, q):
+        return -GRAVITY * self.length * jnp.cos(q[0])
+
+
+def turning(t, y):
+    return y[1]
+
+
+def test_an_orbit_of_a_family():
+    orbit = periodic_orbit(Pendulum(), ([1.0], [0.0]), turning)
+    exact = 4.0 * np.sqrt(1.0 / GRAVITY) * ellipk(np.sin(0.5 * float(orbit.state[0])) ** 2)
+    np.testing.assert_allclose(orbit.period, exact, rtol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, [1.0], atol=1e-8)
+    assert orbit.family == 1
+    assert orbit.stable
+    assert "family" in repr(orbit)
+
+
+class Rotor(AbstractMode):
+    """A rotor that approaches the speed of its motor."""
+
+    speed: float
+    rate: float = 0.2
+
+    def field(self, t, y):
+        return jnp.array([y[1], self.rate * (self.speed - y[1])])
+
+
+def turned(t, y):
+    return 2.0 * jnp.pi - y[0]
+
+
+def test_an_orbit_up_to_a_symmetry():
+    def shift(y):
+        return y - jnp.array([2.0 * jnp.pi, 0.0])
+
+    orbit = periodic_orbit(Hybrid([Rotor(3.0)]), [0.0, 2.0], turned, symmetry=shift)
+    np.testing.assert_allclose(orbit.state, [0.0, 3.0], atol=1e-11)
+    np.testing.assert_allclose(orbit.period, 2.0 * np.pi / 3.0, rtol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, [np.exp(-0.2 * 2.0 * np.pi / 3.0)], rtol=1e-9)
+
+
+class Radial(AbstractMode):
+    """A rotation with limit cycles of the radii 1 and 2."""
+
+    def field(self, t, y):
+        square = jnp.sum(y**2)
+        growth = 0.1 * (1.0 - square) * (4.0 - square)
+        return jnp.array([growth * y[0] - y[1], y[0] + growth * y[1]])
+
+
+def test_distinct_orbits_are_counted_once():
+    guesses = [[0.9, 0.0], [1.1, 0.0], [1.9, 0.0], [2.05, 0.0]]
+    orbits = periodic_orbit(Hybrid([Radial()]), guesses, lambda t, y: -y[1])
+    radii = sorted(float(abs(orbit.state[0])) for orbit in orbits)
+    np.testing.assert_allclose(radii, [1.0, 2.0], atol=1e-10)
+    assert [bool(orbit.stable) for orbit in orbits] == [True, False]
+
+
+def test_what_is_wrong_is_said():
+    system = Hybrid([Kicked(0.1, 0.4)])
+    with pytest.raises(ValueError, match=r"the section was not crossed again within t1 = 50 s"):
+        periodic_orbit(system, [0.0, 0.8], lambda t, y: y[0] + 5.0, t1=50.0)
+    with pytest.raises(ValueError, match="pass the section or the period"):
+        periodic_orbit(system, [0.0, 0.8], wall, period=3.0)
+    with pytest.raises(ValueError, match="depends on time"):
+        periodic_orbit(Hybrid([Driven(0.2, 1.0)]), [0.0, 0.8], turning)
+    with pytest.raises(ValueError, match="free = "):
+        periodic_orbit(system, [0.0, 0.8], wall, free=["speed"])
