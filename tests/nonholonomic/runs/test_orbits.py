@@ -66,7 +66,17 @@ class Walker(AbstractMode):
         return jnp.array([theta_rate, phi_rate, acceleration, swing])
 
     def margin(self, t, y):
-        return y[1] - 2.0 * y[0]
+        return y[0]
+
+    def reset(self, t, y):
+        return y, 1
+
+
+class Landing(Walker):
+    """The second half of a step. In the first half, the foot that swings passes through the ground."""
+
+    def margin(self, t, y):
+        return 2.0 * y[0] - y[1]
 
     def reset(self, t, y):
         theta, c = y[0], jnp.cos(2.0 * y[0])
@@ -74,13 +84,17 @@ class Walker(AbstractMode):
 
 
 def heel(t, y):
-    return y[1] - 2.0 * y[0]
+    return 2.0 * y[0] - y[1]
+
+
+def walker(slope):
+    return Hybrid([Walker(slope), Landing(slope)])
 
 
 def test_the_simplest_walker():
     theta, rate = 0.2, -0.2
     start = [theta, 2.0 * theta, rate, (1.0 - np.cos(2.0 * theta)) * rate]
-    orbit = periodic_orbit(Hybrid([Walker(0.009)]), start, heel)
+    orbit = periodic_orbit(walker(0.009), start, heel)
     np.testing.assert_allclose(orbit.state[jnp.array([0, 2])], [0.2003109005443, -0.1998324730050], atol=1e-12)
     np.testing.assert_allclose(orbit.period, 3.882463752851, atol=1e-11)
     np.testing.assert_allclose(orbit.multipliers[:2].real, -0.19009984, atol=1e-8)
@@ -89,11 +103,9 @@ def test_the_simplest_walker():
     assert orbit.error < 1e-9
     assert "stable periodic orbit with a period of 3.88246375285" in repr(orbit)
 
-
-def test_a_period_doubling_of_the_walker():
-    """A multiplier is -1 at the slope 0.0150884379."""
-    start = [0.24, 0.48, -0.24, -0.027]
-    orbit = periodic_orbit(Hybrid([Walker(0.0150884379)]), start, heel)
+    # A period doubling at the slope 0.0150884379.
+    for slope in (0.011, 0.013, 0.0150884379):
+        orbit = periodic_orbit(walker(slope), orbit.state, heel)
     np.testing.assert_allclose(orbit.multipliers[0], -1.0, atol=1e-7)
 
 
