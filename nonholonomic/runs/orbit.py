@@ -26,12 +26,12 @@ from ..text import shown
 from ..validation import as_number, is_traced, require_outside
 from .crossings import on_margin, section_of
 from .event import Ensemble
-from .model import AbstractModel, check_run, model_of, require_event, settings_for_lanes
+from .model import AbstractModel, AbstractSceneModel, check_run, model_of, require_event, settings_for_lanes
 
 #: The most Newton steps; the residual at which they have converged, in units of the tolerance; the tolerance of the last step.
 MOST_NEWTON, CONVERGED, FINER = 30, 30.0, 100.0
 
-#: Directions in which 1 - J is smaller than this fraction of its norm belong to a family of orbits.
+#: Directions in which 1 - J is smaller than this, or than a hundredth of it of a large 1 - J, belong to a family of orbits.
 RANK = 1e-7
 
 #: A guess this near the section, in units of the period, lies on it.
@@ -357,7 +357,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
             left_vectors, values, right_vectors = jnp.linalg.svd(
                 jnp.where(is_sound[:, None, None], matrix, jnp.eye(size)[:, free]), full_matrices=False
             )
-            is_own = values > RANK * values[:, :1]
+            is_own = values > RANK * jnp.maximum(1.0, 1e-2 * values[:, :1])
             factors = jnp.where(is_own, 1.0 / jnp.where(is_own, values, 1.0), 0.0)
             inverse = jnp.einsum("ckf,ck,cnk->cfn", right_vectors, factors, left_vectors)
             change = jnp.zeros_like(state).at[free].set(jnp.einsum("cfn,nc->fc", inverse, miss))
@@ -560,7 +560,7 @@ def periodic_orbit(
         options = {"free": free, "symmetry": symmetry, "direction": direction, "t1": t1, "tolerance": tolerance}
         return distinct_orbits(system, start, event, options | {"period": period, "solver": solver})
     model = model_of(system, start, section_of(event, direction, "after"))
-    if not hasattr(model, "form"):
+    if isinstance(model, AbstractSceneModel):
         raise ValueError("system: periodic_orbit needs a Hybrid or an AbstractSystem; crossings runs scenes")
     if period is None:
         require_event(model)

@@ -229,7 +229,7 @@ class Radial(AbstractMode):
 
     def field(self, t, y):
         square = jnp.sum(y**2)
-        growth = 0.1 * (1.0 - square) * (4.0 - square)
+        growth = 0.01 * (1.0 - square) * (4.0 - square)
         return jnp.array([growth * y[0] - y[1], y[0] + growth * y[1]])
 
 
@@ -247,7 +247,10 @@ def test_what_is_wrong_is_said():
         periodic_orbit(system, [0.0, 0.8], lambda t, y: y[0] + 5.0, t1=50.0)
     with pytest.raises(ValueError, match="pass the section or the period"):
         periodic_orbit(system, [0.0, 0.8], wall, period=3.0)
-    with pytest.raises(ValueError, match="depends on time"):
+    with pytest.raises(ValueError, match="depend on time"):
         periodic_orbit(Hybrid([Driven(0.2, 1.0)]), [0.0, 0.8], turning)
+    top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    with pytest.raises(ValueError, match="crossings runs scenes"):
+        periodic_orbit(tippe.Scene(top), tippe.Launch(0.1, 155.0), lambda t, motion: 0.3 - motion.theta)
     with pytest.raises(ValueError, match="free = "):
         periodic_orbit(system, [0.0, 0.8], wall, free=["speed"])
