@@ -284,7 +284,11 @@ def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, res
 
 
 def all_rounds(
-    carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance, most_rounds: int = MOST_ROUNDS
+    carry: Carry,
+    groups: Sequence[Sequence[int]],
+    solve: Advance,
+    reset: Advance,
+    most_rounds: int | Int[Array, ""] = MOST_ROUNDS,
 ) -> Carry:
     """Loop over rounds while a cell is running, on the host if the runs are NumPy arrays. **Arguments:** as for `one_round`."""
     xp = carry[0].status.__array_namespace__()

@@ -4,6 +4,7 @@ A run continues through its crossings and through its resets; nothing starts aga
 lanes, and the resets that cross in the rounds of the modes.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -149,12 +150,16 @@ def crossings_in_cells(
             outcome, new = followed(problem, left, kept, runs.end_time, numbers[0], jnp.asarray(size))
             if after:
                 is_reset = (outcome.status == CROSSED) & on_margin(problem, outcome.end_time, outcome.state)
-                outcome = outcome._replace(status=jnp.where(is_reset, LEFT_DOMAIN, outcome.status))
+                shift = jnp.where(is_reset, outcome.crossing_time - outcome.end_time, 0.0)
+                moved = outcome.state + shift * problem.field(outcome.end_time, outcome.state)
+                status = jnp.where(is_reset, LEFT_DOMAIN, outcome.status)
+                outcome = outcome._replace(status=status, end_time=outcome.end_time + shift, state=moved)
             at_end = (outcome.end_time - outcome.crossing_time <= SAME * outcome.end_time) & jnp.isfinite(
                 outcome.crossing_time
             )
             new = new._replace(at_end=at_end & (outcome.status == LEFT_DOMAIN))
-            return chosen(active, (after_solve(runs, outcome, horizon), new), carry)
+            advanced = (after_solve(runs, outcome, horizon), new)
+            return jax.tree.map(functools.partial(jnp.where, active), advanced, carry)
 
         def reset(numbers: Sequence[int], carry: PyTree, lost: Bool[Array, " cells"]) -> PyTree:
             (runs, kept), cell = carry, selected_cells(lost)
@@ -201,40 +206,36 @@ def crossings_in_cells(
     return status, {"time": kept.time.T, "end_time": ended.end_time} | values | counts
 
 
-class Crossings(NamedTuple):
-    """The crossings in a table: the names of the quantities, and as for `crossings`."""
+class Crossings(Samples):
+    """The crossings in a table: their numbers, counted from 1, in place of times; and the names of the quantities."""
 
-    names: tuple[str, ...]
-    skip: int
-    count: int
-    side: str
-
-    @property
-    def times(self) -> np.ndarray:
-        """The numbers of the crossings, counted from 1."""
-        return np.arange(self.skip + 1, self.skip + self.count + 1)
+    after: ClassVar[bool] = False
 
     def variables(self, model: AbstractModel) -> dict[str, Variable]:
         """The variables of the table with the times and the quantities."""
-        quantities = Samples(self.times, self.names).variables(model)
         variables = {"time": Variable("s", np.float64, inner=("crossing",), long_name="time of the crossing")}
         return variables | {
-            name: variable._replace(inner=("crossing", *variable.inner[1:])) for name, variable in quantities.items()
+            name: variable._replace(inner=("crossing", *variable.inner[1:]))
+            for name, variable in super().variables(model).items()
         }
 
     def inner(self, model: AbstractModel) -> list[Axis]:
         """The dimensions of these variables."""
-        _, *vectors = Samples(self.times, self.names).inner(model)
-        return [Axis("crossing", "crossing", "1", self.times, "crossing"), *vectors]
+        return [Axis("crossing", "crossing", "1", self.times, "crossing"), *super().inner(model)[1:]]
 
     def solve(
         self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
-    ) -> tuple[Int[Array, " cells"], dict[str, np.ndarray]]:
+    ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
         """The `Status` of all cells, of which only the first `count` are run, and the variables of the table."""
-        numbers = (jnp.asarray(t1, float), jnp.asarray(count), jnp.asarray(self.skip))
-        options = (size, self.count, self.side == "after")
-        status, values = crossings_in_cells(cells, self.names, *numbers, settings, *options)
+        numbers = (jnp.asarray(t1, float), jnp.asarray(count), jnp.asarray(int(self.times[0]) - 1))
+        status, values = crossings_in_cells(cells, self.names, *numbers, settings, size, len(self.times), self.after)
         return status, jax.tree.map(np.asarray, values)
+
+
+class CrossingsAfter(Crossings):
+    """Crossings with the states after the resets at the section."""
+
+    after = True
 
 
 class Rise(eqx.Module):
@@ -334,6 +335,7 @@ def crossings(
         raise ValueError(f"quantities = {shown(quantities)} must be a list of names")
     require_names(model.quantities, names)
     options = Options(tolerance, solver, max_steps, scattered, False, (), path, progress, executor)
-    samples = Crossings(tuple(names), int(skip), int(count), side)
+    kind, crossing = (CrossingsAfter, "after") if side == "after" else (Crossings, "first")
+    samples = kind(np.arange(skip + 1.0, skip + count + 1.0), tuple(names))
     named = named_axes(model, {} if axes is None else axes)
-    return table_of(model, named, float(t1), "first", options, TableForm(), samples=samples, timed=False)
+    return table_of(model, named, float(t1), crossing, options, TableForm(), samples=samples, timed=False)

@@ -76,18 +76,23 @@ class Orbit(eqx.Module):
 
     >>> import jax.numpy as jnp
     >>> import nonholonomic
-    >>> nonholonomic.Orbit(jnp.array(2.0), jnp.array([1.0]), jnp.array([0.5 + 0.0j]), 1e-12, 1e-13, 0, 3, 0, ("y0",)).stable
-    Array(True, dtype=bool)
+    >>> none = jnp.array(0)
+    >>> numbers = (jnp.array(2.0), jnp.array([1.0]), jnp.array([0.5 + 0.0j]), jnp.array(1e-12), jnp.array(1e-13))
+    >>> print(nonholonomic.Orbit(*numbers, none, none + 3, none, ("y0",)))
+    stable periodic orbit with a period of 2 s
+      y0 = 1
+      multipliers 0.5
+      error below 1e-12, Newton steps 3
     """
 
-    period: Float[ArrayLike, "..."]
-    state: Float[ArrayLike, "... components"]
-    multipliers: Complex[ArrayLike, "... multipliers"]
-    error: Float[ArrayLike, "..."]
-    residual: Float[ArrayLike, "..."]
-    family: Int[ArrayLike, "..."]
-    iterations: Int[ArrayLike, "..."]
-    reason: Int[ArrayLike, "..."]
+    period: Float[Array, "..."]
+    state: Float[Array, "... components"]
+    multipliers: Complex[Array, "... multipliers"]
+    error: Float[Array, "..."]
+    residual: Float[Array, "..."]
+    family: Int[Array, "..."]
+    iterations: Int[Array, "..."]
+    reason: Int[Array, "..."]
     names: tuple[str, ...] = eqx.field(static=True)
 
     @property
@@ -188,7 +193,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
     with_multipliers: bool = eqx.field(static=True, default=True)
 
     @classmethod
-    def of(cls, model: AbstractModel, t1: Array, settings: Settings, *options: Any) -> tuple[Any, ...]:
+    def of(cls, model: Any, t1: Array, settings: Settings, *options: Any) -> tuple[Any, ...]:
         """The solve and its leaves. **Arguments:** `options`: the fields from `is_driven` on."""
         unchecked = is_traced((model, t1, settings.tolerance))
         floats, rest = eqx.partition(model, eqx.is_inexact_array)
@@ -276,10 +281,10 @@ class OrbitSolve(AbstractDifferentiableSolve):
             is_here, primal = ended.mode == number, of_mode.parts(ended.state)[0]
             (_, moved), (delays, changes) = self.at_section(of_mode, ended.state)
             problem = of_mode.mode.problem(primal[:-1])
-            if of_mode.mode.margins and not self.is_driven:
+            own_mode: Any = of_mode.mode
+            if own_mode.margins and not self.is_driven:
                 at_reset = is_here & on_margin(problem, ended.end_time, primal[:-1])
-                mode_and_tangents = (of_mode.mode, *of_mode.tangents)
-                through, *by = (dataclasses.replace(part, continues=True) for part in mode_and_tangents)
+                through, *by = (dataclasses.replace(part, continues=True) for part in (own_mode, *of_mode.tangents))
                 onward = dataclasses.replace(of_mode, mode=through, tangents=tuple(by))
                 transition = onward.reset_map(ended.state.at[:size].set(moved), jnp.full(cells, jnp.inf))
                 after = jnp.reshape(transition.state, rows.shape)
@@ -559,7 +564,7 @@ def periodic_orbit(
     if is_several(start):
         options = {"free": free, "symmetry": symmetry, "direction": direction, "t1": t1, "tolerance": tolerance}
         return distinct_orbits(system, start, event, options | {"period": period, "solver": solver})
-    model = model_of(system, start, section_of(event, direction, "after"))
+    model: Any = model_of(system, start, section_of(event, direction, "after"))
     if isinstance(model, AbstractSceneModel):
         raise ValueError("system: periodic_orbit needs a Hybrid or an AbstractSystem; crossings runs scenes")
     if period is None:
@@ -570,8 +575,8 @@ def periodic_orbit(
             )
     else:
         model = model.without_event()
-    t1 = t1 if period is None else period
-    check_run(model, t1, tolerance)
+    horizon = t1 if period is None else period
+    check_run(model, horizon, tolerance)
     names = tuple(model.quantities)
     unknown = [name for name in free or () if name not in names]
     if unknown or (free is not None and (isinstance(free, str) or not len(free))):
@@ -579,11 +584,11 @@ def periodic_orbit(
     places = tuple(k for k, name in enumerate(names) if free is None or name in free)
     options = (period is not None, places, symmetry)
     settings = settings_for_lanes(tolerance, solver)
-    time, state, *parts = differentiable_solve(*OrbitSolve.of(model, as_number(t1), settings, *options))
+    time, state, *parts = differentiable_solve(*OrbitSolve.of(model, as_number(horizon), settings, *options))
     real, imaginary, error, residual, *counts = parts
     family, iterations, reason = (jnp.asarray(count).astype(int) for count in counts)
     orbit = Orbit(time, state, real + 1j * imaginary, error, residual, family, iterations, reason, names)
     if not is_traced(reason) and np.ndim(reason) == 0 and int(reason):
-        why = REASONS[int(reason)].format(t1=float(t1), residual=float(residual), steps=int(iterations))
+        why = REASONS[int(reason)].format(t1=t1, residual=float(residual), steps=int(iterations))
         raise ValueError(f"start: no periodic orbit was found: after {int(iterations)} Newton steps, {why}")
     return orbit
