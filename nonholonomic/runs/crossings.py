@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, greatest, written_in_place
+from ..hybrid import MOST_ROUNDS
 from ..hybrid.ensemble import after_reset, after_solve, all_rounds, at_start, chosen, over_cells, selected_cells
 from ..integration import AbstractProblem, Lanes, LaneState, Settings, States
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, LEFT_DOMAIN, RUNNING, Status
@@ -35,9 +36,6 @@ from .table import TableForm
 #: A crossing within this fraction of the time in a mode before the end of the mode is at its end: the event function vanishes
 #: with the margin of the mode.
 SAME = 1e-9
-
-#: A run with more resets between two crossings ends as `UNRESOLVED`.
-MOST_ROUNDS = 2000
 
 
 class Kept(NamedTuple):
@@ -185,6 +183,7 @@ def crossings_in_cells(
             return chosen(lost, new, runs), kept
 
         groups, runs = [(number,) for number in range(len(modes))], at_start(first, states, cells, len(model.counters))
+        # As many resets between two crossings as in a run.
         most = MOST_ROUNDS * (count + skip)
         ended, kept = all_rounds((runs, start(len(states))), groups, solve, reset, most)
         counted = ended.counts

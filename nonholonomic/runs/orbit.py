@@ -53,7 +53,7 @@ PARTS = 9
 #: Why there is no orbit, by `Orbit.reason`.
 REASONS = (
     "",
-    "the section was not crossed again within t1 = {t1:.6g} s from there",
+    "the run from there ends, or does not cross the section again within t1 = {t1:.6g} s",
     "the return from there ends in another mode than the first",
     "a return from there still misses it by {residual:.2g} after {steps} Newton steps",
     "a number is illegal",

@@ -243,7 +243,7 @@ def test_distinct_orbits_are_counted_once():
 
 def test_what_is_wrong_is_said():
     system = Hybrid([Kicked(0.1, 0.4)])
-    with pytest.raises(ValueError, match=r"the section was not crossed again within t1 = 50 s"):
+    with pytest.raises(ValueError, match=r"does not cross the section again within t1 = 50 s"):
         periodic_orbit(system, [0.0, 0.8], lambda t, y: y[0] + 5.0, t1=50.0)
     with pytest.raises(ValueError, match="pass the section or the period"):
         periodic_orbit(system, [0.0, 0.8], wall, period=3.0)
