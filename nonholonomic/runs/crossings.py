@@ -220,7 +220,7 @@ class Crossings(Samples):
 
     def inner(self, model: AbstractModel) -> list[Axis]:
         """The dimensions of these variables."""
-        return [Axis("crossing", "crossing", "1", self.times, "crossing"), *super().inner(model)[1:]]
+        return [Axis("crossing", "crossing", "1", self.times.astype(int), "crossing"), *super().inner(model)[1:]]
 
     def solve(
         self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
@@ -316,7 +316,7 @@ def crossings(
     >>> spring = nonholonomic.Hybrid([Spring(damping=0.1)])
     >>> table = nonholonomic.crossings(spring, [1.0, 0.0], 50.0, middle, count=2, skip=1, progress=False)
     >>> print(table.crossing, table.time.round(6), table.y1.round(6), table.status)
-    [2 3] [ 7.922167 14.213214] [-0.672961 -0.491359] event
+    [2 3] [ 7.913901 14.204955] [-0.673212 -0.491522] event
 
     ```
     """
