@@ -295,8 +295,8 @@ class ScatteredJob(NamedTuple):
 #: Ratio of the tolerance of each run to that of the next. With a pair of eighth order, the second run costs 1.8 times as
 #: much as the first, and the third 3.2 times. The error of the second run is mostly a hundredth of that of the first, so the
 #: difference of the two is the error of the first. Where both errors happen to be alike, or where functions of events and
-#: not the tolerance limit the steps, the third run differs from both. With two runs, up to 7 % of the bounds of a kind of
-#: systems in `tests/nonholonomic/runs/test_error_bounds.py` fail.
+#: not the tolerance limit the steps, the third run differs from both. With two runs, 0.05 to 8 % of the bounds of the systems
+#: in `tests/nonholonomic/runs/test_error_bounds.py` fail, with the errors of the location of events.
 FINER = 100.0
 
 #: Ratio of the bound to the largest difference of the runs. With a ratio of 3, twice as many errors exceed the bound.
