@@ -85,8 +85,10 @@ def with_numbers(roots: dict[str, PyTree], values: Mapping[str, ArrayLike]) -> d
     **Raises:** `ValueError` for a name that matches no parameter.
     """
     values_of_names = numbers_of(roots)
-    for unknown in [name for name in values if name not in values_of_names]:
-        full_name("unknown axis", unknown, [name for name, value in values_of_names.items() if value is not None])
+    known = [name for name, value in values_of_names.items() if value is not None]
+    values = {
+        name if name in values_of_names else full_name("unknown axis", name, known): values[name] for name in values
+    }
     return {root: _replaced(root, tree, values) for root, tree in roots.items()}
 
 

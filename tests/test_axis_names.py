@@ -13,7 +13,7 @@ from tops import rutstam_top
 import nonholonomic.sweeps
 import stroller
 import tippe
-from nonholonomic.parameters import numbers
+from nonholonomic.parameters import numbers, with_numbers
 from tippe.runs.model import TopModel
 from tippe.runs.verbs import launches
 
@@ -58,6 +58,11 @@ def test_a_coordinate_of_the_place_does_not_lend_its_unit_to_the_friction():
     labels = TopModel(scene=scene, launch=tippe.Launch(0.1, 155.0, place=(-1.2, 0.1))).label
     assert labels(["scene.friction.mu"])["scene.friction.mu"][:2] == ("mu", "s m-1")
     assert labels(["launch.place[0]"])["launch.place[0]"][:2] == ("mu", "rad")
+
+
+def test_a_number_is_replaced_by_the_end_of_its_name():
+    scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
+    assert with_numbers({"scene": scene}, {"mu": 0.9})["scene"].friction.mu == 0.9
 
 
 @pytest.mark.parametrize(

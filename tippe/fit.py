@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -175,9 +174,10 @@ class AbstractTimes(AbstractEventTimes):
         return self.labels_in(unit_of(self.launch))
 
     def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
+        # In NumPy: JAX would take a millisecond for each launch.
+        launch = jax.tree.map(np.asarray, self.launch)
         launches = [
-            jax.tree.map(lambda leaf, k=k: leaf if jnp.ndim(leaf) == 0 else leaf[k], self.launch)
-            for k in range(self.size)
+            jax.tree.map(lambda leaf, k=k: leaf if np.ndim(leaf) == 0 else leaf[k], launch) for k in range(self.size)
         ]
         return tuple(distinguishing_labels([("launch",)] * self.size, launches, unit=unit, longest=None))
 

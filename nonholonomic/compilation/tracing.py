@@ -199,7 +199,7 @@ KINKS = ["max", "min", "abs", "sign", "clamp"]
 STAIRS = ["floor", "ceil", "round"]
 
 #: Traced functions that are smooth, whatever their operations: one of JAX, and the splines of plans.
-SMOOTH = ["sinc", "evaluate_spline"]
+SMOOTH = ["sinc", "spline_of_a_plan"]
 
 
 def jumps_of(function: Function, t: PyTree, *others: PyTree) -> tuple[Float[Array, " jumps"], tuple[str, ...]]:

@@ -21,6 +21,7 @@ from ..identification.result import check_search, most_likely
 from ..integration import Settings
 from ..integration.problem import MOST_STEPS, tolerance_bound
 from ..parameters import full_name, require_apart
+from ..sweeps.running import workers
 from ..terminal import status_line
 from ..text import in_unit, likely, shown, unit_of
 from ..validation import as_number, nan_unless, require
@@ -421,8 +422,8 @@ def _predicted_by_tables(
         order = np.argsort(~is_legal, kind="stable")
         order[count:] = order[0]
         cells, t1 = jax.tree.map(lambda leaf: leaf[order] if eqx.is_array(leaf) else leaf, (model, horizon))
-        # Without cells, new programs are compiled together, and others take no time.
-        for first in (0, count):
+        # Without cells, new programs are compiled together, by two threads. A single core stays in this one.
+        for first in (0, count) if workers() > 1 else (count,):
             status, time, ends = first_events(cells, np.asarray(t1), size, first, settings)
         time = data.of_ends(cells, t1, time, ends)
         predictions[order[:count]] = np.where(np.isin(status, SILENT), np.nan, time)[:count]
@@ -584,7 +585,7 @@ def posterior_of_runs(
     seen = np.concatenate([first + source.seen for first, source in zip(offsets, several, strict=False)])
     first, own = sources[0].model, set(map(own_name, unknowns))
     starts = [name for name in first.known if name.startswith(("launch.", "start")) and name not in own]
-    fixed = tuple(name for name in starts if np.any(first.value(name)))
+    fixed = tuple(name for name in starts if np.ndim(first.value(name)) == 0 and np.any(first.value(name)))
     model = DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS), fixed)
     if priors is not None and not isinstance(priors, dict):
         raise ValueError(

@@ -289,7 +289,8 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
     """
     variables, slopes = job.variables, job.slopes or {}
     for name, (_, unit, _) in job.model.label([*slopes]).items():
-        slope, unit = slopes[name], "s" if unit == "1" else f"s ({unit})-1"
+        slope, inverse = slopes[name], f"{unit}-1" if unit.isalpha() else f"({unit})-1"
+        unit = "s" if unit == "1" else f"s {inverse}"
         variables |= {slope: Variable(unit, np.float64, long_name=f"{job.form.event} time by {name}")}
     request = job.model.description() | {axis.number: "an axis" for axis in grid} | request
     integrator = job.settings.for_single_runs if job.by_diffrax else job.settings.for_lanes
@@ -297,7 +298,7 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
     request |= {SHOWN_IN: unit_of(job.model)}
     # Requests of earlier versions, with which a table may resume, lack these unless they were set.
     request |= {"max_steps": int(options.max_steps)} if options.max_steps != DEFAULT_MAX_STEPS else {}
-    request |= {"errors": True} if options.errors else {}
+    request |= {"errors": "from runs at 1e-2 and 1e-4 of the tolerance"} if options.errors else {}
     request |= {"sensitivities": list(slopes)} if slopes else {}
     if options.path is not None and has_users_code(job.model.__reduce__()[1]):
         request |= {EQUATIONS: checksum_of(job.model)}

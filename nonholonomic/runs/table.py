@@ -320,7 +320,8 @@ def other_tolerances(tolerance: float) -> list[float]:
     # Because of rounding, the quotient of 1e-12 may be below the least tolerance.
     if tolerance / FINER <= 0.99 * tightest:
         return [tolerance * FINER]
-    return sorted({max(tolerance / FINER**power, tightest) for power in (1, 2)}, reverse=True)
+    second, third = (max(tolerance / FINER**power, tightest) for power in (1, 2))
+    return [second, third] if third < 0.2 * second else [second]
 
 
 def error_bound(

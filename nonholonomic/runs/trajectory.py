@@ -27,6 +27,7 @@ from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_
 from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stages_of
 from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
+from ..views.pages import require_labels
 from ..views.stage import Draw, Drawing, Parts, Wheel, curves_in, meshes_of, of_grid
 from .model import AbstractModel, Names, Sliders, model_of, run_of
 
@@ -125,7 +126,7 @@ def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: 
     model.check()
     live, stage = page_of(model, sliders, t1)
     (stage,) = curves_in([stage], unit or unit_of(model))
-    html_page = live_page(live if label is None else live._replace(title=label), stage)
+    html_page = live_page(live if label is None else live._replace(title=require_labels([label], [model])[0]), stage)
     if path is not None:
         html_page.save(path)
     return html_page

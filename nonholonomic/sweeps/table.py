@@ -483,7 +483,7 @@ def run_table(
     return Table(coords, values, units, attributes, {}, inner, long_names)
 
 
-class Tabular(Viewable):
+class Tabular(Viewable, abc.ABC):
     """A run whose quantities over time are a table, which gives it `to_xarray`, `save`, `plot` and `portrait`.
 
     **Example:**
@@ -583,7 +583,14 @@ class Tabular(Viewable):
         title, labels = (labels[0], [""]) if label is None and len(runs) == 1 else ("", labels)
         if quantities:
             tables = [run.table_of(quantities).drawn_in(unit, *quantities) for run in runs]
-            marks = [tuple((in_unit("s", unit)[1] * time, words) for time, words in run.marks) for run in runs]
+            marks = [
+                tuple(
+                    (in_unit("s", unit)[1] * time, words)
+                    for time, words in run.marks
+                    if float(run.t[0]) <= time <= float(run.t[-1])
+                )
+                for run in runs
+            ]
             drawing = draw_series(tables, quantities, labels, marks, ax)
         elif ax is None:
             drawing = draw_curves(curves_in(self.stages(runs[1:]), unit), labels)

@@ -81,7 +81,8 @@
     const outcome = asks.read("outcome", values), took = performance.now() - began;
     const run = recorded(most), word = words[outcome[0]] || "illegal";
     const marked = `${word === "inverted" ? "turned over" : word.replace(/_/g, " ")} at ${digits(outcome[1], 3)} s`;
-    run.marks = Number.isFinite(outcome[1]) ? [[outcome[1], marked]] : [];
+    // The answer may be another quantity than a time.
+    run.marks = facts.answer.unit === "s" && Number.isFinite(outcome[1]) ? [[outcome[1], marked]] : [];
     tell(outcome, run, took);
     if (player) player.setRun(0, 0, run);
     live.outcome = { status: words[outcome[0]], value: outcome[1], end: run.times[run.times.length - 1] };

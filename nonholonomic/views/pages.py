@@ -116,7 +116,7 @@ def page(
             "floats": floats.view(np.uint8).reshape(-1, 4).T.tobytes(),
             "whole": whole.tobytes(),
         }
-        view = [script(json.dumps(facts), ' type="application/json" id="facts"')]
+        view = [script(json.dumps(facts).replace("<", "\\u003c"), ' type="application/json" id="facts"')]
         for name, part in data.items():
             coded = base64.b64encode(zlib.compress(part, 9)).decode()
             view.append(script(coded, f' type="text/plain" id="{name}"'))

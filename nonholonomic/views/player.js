@@ -202,7 +202,7 @@ window.views = window.views || {};
         const { target } = event, act = acts[event.code], own = target === this.slider;
         if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
         if (/^(INPUT|SELECT|TEXTAREA)$/.test(target.tagName) && !own) return;
-        if (event.code === "Space" && target.tagName === "BUTTON") return;
+        if (event.code === "Space" && /^(BUTTON|SUMMARY)$/.test(target.tagName)) return;
         event.preventDefault();
         act();
       });

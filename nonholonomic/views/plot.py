@@ -437,7 +437,10 @@ class _Drawn(NamedTuple):
         factors = np.array(factors)
         for indices in series:
             label, shown = rows[indices[0]].label, shown_units[indices[0]]
-            quantity = label.partition("(")[0] if "(" in label else "time" if shown in UNITS["s"] else "measured"
+            quantity, has_name, _ = label.partition("(")
+            # A number in parentheses after a blank only tells equal launches apart.
+            if not has_name or quantity.endswith(" "):
+                quantity = "time" if shown in UNITS["s"] else "measured"
             names.append(_with_unit(quantity, shown))
         value, upper, errors, predicted = (
             np.array([getattr(row, name) for row in rows]) for name in ("value", "upper", "error", "prediction")

@@ -446,8 +446,9 @@ SEARCH_CURVATURES = (0.98, 0.85)
 #: that touch each other reach as far.
 TURNING_SPACE = 4.0
 
-#: Steps of a straight way from the middle of a map, and points of its table from the middle to each side.
-STEPS, MAPPED = 48, 64
+#: Steps of a straight way from the middle of a map, points of its table from the middle to each side, and the most tables, each
+#: larger than the one before, until one contains the start and the goal.
+STEPS, MAPPED, MOST_MAPS = 48, 64, 4
 
 #: Points around an obstacle, steps of Newton's method to their feet on the ground, and the least cosine of the angle by which
 #: the ground may turn beneath an obstacle, of 45 degrees: a steeper wall would be longer than its size by more than 11 %.
@@ -483,7 +484,6 @@ def pose_of(scene: Scene, place: tuple[ArrayLike, ...], heading: Float[Array, ""
 @eqx.filter_jit
 def poses_at(surface: AbstractSurface, points: Float[Array | np.ndarray, "n 3"]) -> Float[Array, "n components"]:
     """The poses of points and headings (x, y, angle), where the ground names its places x and y."""
-
     along = jnp.stack([jnp.cos(points[:, 2]), jnp.sin(points[:, 2])], axis=1)
     place, along = jax.jvp(
         lambda at: jnp.stack(surface.charted(tuple(at.T))[0][: surface.axes], axis=1),
@@ -586,17 +586,23 @@ class Problem(eqx.Module):
         places = np.concatenate([ends, *(frame[0] + outline_of(part) @ frame[1:3] for part, frame in self.standing)])
         # Along a sphere, no place is further than half a circle about the straight line to it.
         reach = np.pi / 2.0 * np.linalg.norm(places - middle[0], axis=1).max() + self.turns[2]
-        spacing, number = float(reach) / MAPPED, np.arange(-MAPPED, MAPPED + 1)
-        ways = spacing * np.stack(np.meshgrid(number, number, indexing="ij"), axis=-1)
-        places = np.asarray(walked(surface, middle, ways.reshape(-1, 2))).reshape(*ways.shape[:2], 3)
-        return (spacing, np.stack([places, *np.gradient(places, spacing, axis=(0, 1))], axis=-2))
+        number = np.arange(-MAPPED, MAPPED + 1)
+        for _ in range(MOST_MAPS):
+            spacing = float(reach) / MAPPED
+            ways = spacing * np.stack(np.meshgrid(number, number, indexing="ij"), axis=-1)
+            table = np.asarray(walked(surface, middle, ways.reshape(-1, 2))).reshape(*ways.shape[:2], 3)
+            if all(np.linalg.norm(table - end, axis=-1).min() <= spacing for end in ends):
+                break
+            # Elsewhere, ways round may be longer.
+            reach *= 1.5
+        return (spacing, np.stack([table, *np.gradient(table, spacing, axis=(0, 1))], axis=-2))
 
     def point(self, pose: Float[Array | np.ndarray, " components"]) -> Float[np.ndarray, " 3"]:
         """The point and the heading (x, y, angle) of a pose on the map, the nearest to its middle if there are several."""
         (place, heading), corner = np.asarray(pose).reshape(2, -1), np.zeros(2)
         if self.map is not None:
             spacing, frames = self.map
-            away = np.linalg.norm(frames[:, :, 0] - place, axis=-1)
+            away = np.nan_to_num(np.linalg.norm(frames[:, :, 0] - place, axis=-1), nan=np.inf)
             numbers = np.argwhere(away <= max(2.0 * away.min(), 0.5 * spacing))
             number = numbers[np.argmin(np.linalg.norm(numbers - MAPPED, axis=-1))]
             origin, *slopes = frames[tuple(number)]
@@ -718,11 +724,13 @@ def checked_problem(
         cosines = np.asarray(feet(scene.surface, frame, parts.reshape(-1, 2))[1]).reshape(len(SHARES), -1)
         steep = ~np.all(cosines >= STEEPEST, axis=1)
         if steep.any():
-            name, size = ("radius", part.radius) if isinstance(part, Disc) else ("size", max(part.size))
-            most = SHARES[max(np.argmax(steep) - 1, 0)] * float(size)
+            name, sizes = ("radius", [part.radius]) if isinstance(part, Disc) else ("size", part.size)
+            # The least share may be too large, too.
+            shares = [1.0, SHARES[np.argmax(steep) - 1] if np.argmax(steep) else 0.0]
+            own, most = (" x ".join(f"{share * float(size):.3g}" for size in sizes) for share in shares)
             raise ValueError(
-                f"obstacles[{number}]: {name} = {float(size):g} m must be at most {most:.2g} m at this place, because "
-                "obstacles are flat, and the ground turns by more than 45 degrees beneath it: use several smaller ones"
+                f"obstacles[{number}]: {name} = {own} m must be at most {most} m at this place, because obstacles are flat, "
+                "and the ground turns by more than 45 degrees beneath it: use several smaller ones"
             )
     why = "limits; no plan can keep a limit that is broken at its ends"
     for owner, part, name in (("launch", launch, "steering"), ("launch", launch, "speed"), ("goal", goal, "speed")):

@@ -109,16 +109,21 @@ def weighted(weights: list[Numbers | float], coefficients: Numbers | list[Number
     return a * coefficients[0] + b * coefficients[1] + c * coefficients[2] + d * coefficients[3]
 
 
-# Every run of a plan traces its input several times; `jit` keeps the trace. By its name, the search for jumps knows that it
-# is smooth.
-@partial(jax.jit, static_argnames="derivative")
 def evaluate_spline(coefficients: Numbers, part: Numbers | float, derivative: int = 0) -> Numbers:
     """The value of a spline, or of its derivative, at parts of its whole length, held constant beyond its ends.
 
     Derivatives are with respect to the number of intervals passed.
     """
+    return spline_of_a_plan(coefficients, jnp.clip(part, 0.0, 1.0), derivative)
+
+
+# Every run of a plan traces its input several times; `jit` keeps the trace. By its name, the search for jumps knows that it
+# is smooth.
+@partial(jax.jit, static_argnames="derivative")
+def spline_of_a_plan(coefficients: Numbers, part: Numbers | float, derivative: int) -> Numbers:
+    """As `evaluate_spline`, for parts between 0 and 1."""
     intervals = len(coefficients) - ORDER + 1
-    position = jnp.clip(part, 0.0, 1.0) * intervals
+    position = part * intervals
     first = jnp.clip(jnp.floor(position), 0, intervals - 1).astype(int)
     return weighted(basis(position - first)[derivative], [coefficients[first + k] for k in range(ORDER)])
 

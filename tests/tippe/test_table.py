@@ -74,6 +74,13 @@ def test_a_table_takes_a_launch(rutstam_scene_module):
     assert "end_theta [rad]" in repr(in_radians)
     with pytest.raises(ValueError, match="launch must be left out where its numbers are given"):
         tippe.inversion_table(rutstam_scene_module, launch, theta=0.1, **arguments)
+    with pytest.raises(ValueError, match="pass a launch, or both theta and spin"):
+        tippe.inversion_table(rutstam_scene_module, theta=0.1, **arguments)
+    # An axis replaces a number of the launch.
+    one = tippe.Launch.degrees(theta=6, rpm=1500, azimuth=90)
+    table = tippe.inversion_table(rutstam_scene_module, one, axes={"launch.theta": launch.theta}, **arguments)
+    assert list(table.coords) == ["mu", "theta"]
+    np.testing.assert_array_equal(table.end_theta.T, in_radians.end_theta)
 
 
 def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, rutstam_scene_module, tmp_path):

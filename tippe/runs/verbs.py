@@ -184,12 +184,18 @@ def launches(
     if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
         raise ValueError(f"axes = {shown(axes)} must be a dictionary, path of a number -> values")
     axes = full_axes(axes or {}, [*variable_numbers(scene), *NUMBERS_OF_A_LAUNCH])
+    if launch_values.get("launch") is None and None in (
+        launch_values.get("theta", 0.0),
+        launch_values.get("spin", 0.0),
+    ):
+        raise ValueError("launch = None: pass a launch, or both theta and spin")
     stated, launch_values = launch_values.get("launch"), {k: v for k, v in launch_values.items() if k != "launch"}
     if stated is not None:
         require_kind(stated, "launch", Launch)
         if any(np.any(value) for name, value in launch_values.items() if name != "mu"):
             raise ValueError("launch must be left out where its numbers are given")
-        launch_values = {name: getattr(stated, name, value) for name, value in launch_values.items()}
+        own = {name for name in launch_values if f"launch.{name}" not in axes}
+        launch_values = {name: getattr(stated, name, value) for name, value in launch_values.items() if name in own}
         others = {name: value for name, value in numbers("launch", stated).items() if value is not None}
         axes = {name: value for name, value in others.items() if name[len("launch.") :] not in launch_values} | axes
     friction_numbers = numbers("scene.friction", scene.friction)
@@ -303,7 +309,7 @@ def inversion_table(
       reach the angle in flight.
     - `sticks`, with `SetValuedCoulomb`: number of changes from slip to rolling outside impacts.
     - `time_error` [s], with `errors`: a bound that is infinite if the runs disagree on the status or failed, and 0 if
-      both find no time. `end_time_error` and `end_theta_error` are such bounds, too; `hops_error` and `sticks_error` are
+      none finds a time. `end_time_error` and `end_theta_error` are such bounds, too; `hops_error` and `sticks_error` are
       the differences of the runs; `status_error` is 1 if the runs disagree on the status or failed.
       `Table.digits("time")` shows the correct digits.
     - `time_by_mu` and so on, with `sensitivities`: the derivative of `time` with respect to each parameter; 0 if the top

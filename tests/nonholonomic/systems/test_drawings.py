@@ -167,7 +167,7 @@ def test_what_a_drawing_lacks_is_said_in_pages_with_sliders():
 
 def test_runs_side_by_side_are_all_drawn_by_the_function():
     runs = [simulate(Pendulum(length), ([1.0], [0.0]), 0.5) for length in (1.0, 2.0)]
-    stages = runs[0]._stages([runs[1]], False, None, pendulum)
+    stages = runs[0]._stages([runs[1]], False, None, pendulum, None)
     assert [stage.title for stage in stages] == ["Pendulum", "Pendulum"]
     assert [len(stage.shows[0].arrows) for stage in stages] == [1, 1]
 
@@ -217,7 +217,7 @@ def test_an_unknown_attribute_lists_the_state():
     assert list(run) == ["q0", "rate0"]
 
 
-@pytest.mark.parametrize("name", ["unit", "state", "model", "plot", "time", "end_time"])
+@pytest.mark.parametrize("name", ["state", "model", "plot", "time", "end_time"])
 def test_components_have_no_names_of_a_run(name):
     wrong = type("Wrong", (Decay,), {"names": (name,)})
     with pytest.raises(ValueError, match=rf"Wrong\.names = .* must be 1 different words, .*, such as {name}"):
