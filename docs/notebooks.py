@@ -34,7 +34,9 @@ def notebook(page: Path) -> nbformat.NotebookNode:
     book = jupytext.reads(page.read_text().replace(kernel, f"{kernel}  display_name: Python 3\n", 1), fmt="md:myst")
     for cell in book.cells:
         if cell.cell_type == "markdown":
-            cell.source = re.sub(r"(?<!!)\[([^\]]+)\]\((?!https?:)[^)]*\)", r"\1", cell.source)
+            # Pictures of the checkout are left out, and links to its pages are only their words.
+            cell.source = re.sub(r"!\[[^\]]*\]\((?!https?:)[^)]*\)\n*", "", cell.source)
+            cell.source = re.sub(r"\[([^\]]+)\]\((?!https?:)[^)]*\)", r"\1", cell.source)
         elif "raises-exception" in cell.metadata.get("tags", []):
             cell.source = f"try:\n{textwrap.indent(cell.source, '    ')}\nexcept Exception as error:\n    print(error)"
     book.cells.insert(0, nbformat.v4.new_code_cell(INSTALL))

@@ -323,7 +323,7 @@ def test_the_last_crossing_may_be_at_a_reset():
 def test_a_time_that_is_nan_is_explained():
     class Lost(Ball):
         def reset(self, t, y):
-            return y, 5
+            return y, jnp.array(5)
 
     with pytest.warns(UserWarning, match=r"the run ended as 'failed' at 0\.45152\d s; nonholonomic\.simulate returns"):
         time = event_time(Hybrid([Lost()], event=Bounces(3.0)), START, 2.0)
