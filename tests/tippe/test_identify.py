@@ -77,7 +77,7 @@ def test_friction_from_exact_times(exact_fit):
     # The slow launch adds nothing: it is far from inverting.
     assert abs(result.residuals[3].residual) < 1e-6
     assert result.residuals[3].prediction > 6.0
-    assert "theta 0.3, spin 110" in result.details
+    assert "theta 0.3 rad, spin 110 rad/s" in result.details
     assert result.units == {"scene.friction.mu": "s m-1"}
     assert re.search(r"scene.friction.mu  0\.3.* s/m  \(95 %: 0\..* to 0\..*\)\n", str(result))
 

@@ -197,7 +197,7 @@ def test_wrong_functions_are_named(name):
 
 def test_the_start_of_a_hybrid_obeys_the_constraints_of_its_first_mode():
     with pytest.raises(ValueError, match=r"start: rate = .* violates the constraints by 1"):
-        simulate(Hybrid([Rolling(), Sliding()]), ([0.0, 0.0], [1.0, 0.0]), 1.0)
+        simulate(Hybrid([Rolling(), Sliding(), Rolling()]), ([0.0, 0.0], [1.0, 0.0]), 1.0)
 
 
 def test_a_reset_without_a_margin_is_reported():
