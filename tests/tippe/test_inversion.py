@@ -202,7 +202,7 @@ def test_first_and_last_crossing_in_the_cylinder():
 BAD = [
     ({"t1": -1.0}, "t1 = -1.0 must be greater than 0"),
     ({"t1": math.nan}, "t1 = nan must be finite"),
-    ({"angle": 4.0}, "angle = 4.0 must be at most 3.14159"),
+    ({"angle": 4.0}, "angle = 4.0 must be at most pi rad"),
     ({"tolerance": 0.0}, "tolerance = 0.0 must be at least 1e-14"),
     ({"crossing": "second"}, "crossing = 'second' must be 'first' or 'last'"),
     ({"solver": diffrax.Kvaerno5()}, "must be an explicit Runge-Kutta solver"),

@@ -175,7 +175,7 @@ def test_picture_and_page_share_their_programs(caplog):
         (["--mass", "-1"], "mass = -1.0 must be greater than 0.0"),
         (["--offset", "0.03"], "offset = 0.03 must be less than 0.02"),
         (["--cylinder-radius", "0.01"], "surface radius = 0.01 must be greater than 0.02"),
-        (["--theta", "4"], "theta = .*4.* must be at most 3.14159"),
+        (["--theta", "4"], "theta = .*4.* must be at most pi rad"),
         (["--mu", "nan"], "mu = nan must be finite"),
         (["--out", "/proc/nowhere"], "/proc/nowhere"),
         (["--surface", "plane", "steep"], "--surface plane steep must be one of: sphere RADIUS, "),

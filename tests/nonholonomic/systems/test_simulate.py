@@ -245,7 +245,7 @@ WRONG = {
     ),
     "one constraint without a row": (
         lambda: broken(Sleigh, constraints=lambda self, q: q),
-        r"constraints\(q\) must be of shape \(k, 3\), a row for each constraint, not \(3,\)",
+        r"constraints\(q\) must be of shape \(k, 3\), a row for each constraint, such as .* for one, not \(3,\)",
     ),
     "math in a constraint": (
         lambda: broken(Sleigh, constraints=lambda self, q: jnp.array([[math.sin(q[2]), 0.0, 0.0]])),
