@@ -74,7 +74,7 @@ def test_a_table_takes_a_launch(rutstam_scene_module):
     assert "end_theta [rad]" in repr(in_radians)
     with pytest.raises(ValueError, match="launch must be left out where its numbers are given"):
         tippe.inversion_table(rutstam_scene_module, launch, theta=0.1, **arguments)
-    with pytest.raises(ValueError, match="pass a launch, or both theta and spin"):
+    with pytest.raises(ValueError, match="spin = None is not a number: pass a launch"):
         tippe.inversion_table(rutstam_scene_module, theta=0.1, **arguments)
     # An axis replaces a number of the launch.
     one = tippe.Launch.degrees(theta=6, rpm=1500, azimuth=90)

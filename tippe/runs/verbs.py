@@ -184,11 +184,9 @@ def launches(
     if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
         raise ValueError(f"axes = {shown(axes)} must be a dictionary, path of a number -> values")
     axes = full_axes(axes or {}, [*variable_numbers(scene), *NUMBERS_OF_A_LAUNCH])
-    if launch_values.get("launch") is None and None in (
-        launch_values.get("theta", 0.0),
-        launch_values.get("spin", 0.0),
-    ):
-        raise ValueError("launch = None: pass a launch, or both theta and spin")
+    for name in ("theta", "spin") if launch_values.get("launch") is None else ():
+        if launch_values.get(name, 0.0) is None:
+            raise ValueError(f"{name} = None is not a number: pass a launch, or both theta and spin")
     stated, launch_values = launch_values.get("launch"), {k: v for k, v in launch_values.items() if k != "launch"}
     if stated is not None:
         require_kind(stated, "launch", Launch)
