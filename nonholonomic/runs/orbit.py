@@ -6,6 +6,7 @@ bounds the error. The derivatives of an orbit follow from the implicit function 
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -16,15 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int, PyTree
 
+from ..compilation.tracing import named_errors, with_own_numbers
 from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, tangent_scale, tangents_by
 from ..hybrid import solve_hybrid
 from ..hybrid.saltation import VariationalMode, along, delay, variational_modes, variational_start
 from ..integration import Settings
-from ..integration.problem import CROSSED, REACHED_END, TIGHTEST, legal_run
+from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESOLVED, legal_run
 from ..terminal import status_line
-from ..text import shown
+from ..text import described, shown
 from ..validation import as_number, is_traced, require_outside
-from .crossings import on_margin, section_of
+from .crossings import SAME, on_margin, section_of
 from .event import Ensemble
 from .model import AbstractModel, AbstractSceneModel, check_run, model_of, require_event, settings_for_lanes
 
@@ -50,12 +52,20 @@ SAME_ORBIT = 1e-6
 PARTS = 9
 
 
+#: Multipliers nearer to the unit circle than this count as on it.
+ON_CIRCLE = 1e-9
+
 #: Why there is no orbit, by `Orbit.reason`.
 REASONS = (
     "",
     "the run from there ends, or does not cross the section again within t1 = {t1:.6g} s",
     "the return from there ends in another mode than the first",
     "a return from there still misses it by {residual:.2g} after {steps} Newton steps",
+    "the state is an equilibrium",
+    "the run from there ends before the period",
+    "the integration of the run from there fails",
+    "a reset of the run from there is grazing, and the return map has no derivative",
+    "a reset falls on the end of the period; shift the phase of the drive",
     "a number is illegal",
 )
 
@@ -97,14 +107,19 @@ class Orbit(eqx.Module):
 
     @property
     def stable(self) -> Bool[Array, "..."]:
-        """Whether all multipliers lie inside the unit circle, apart from those of a family, which are 1."""
-        nearest = jnp.argsort(jnp.argsort(jnp.abs(self.multipliers - 1.0), axis=-1), axis=-1)
-        is_own = nearest < jnp.asarray(self.family)[..., None]
-        return jnp.all(is_own | (jnp.abs(self.multipliers) < 1.0), axis=-1)
+        """Whether all multipliers lie inside the unit circle, apart from those of a family, which are 1: at most two for each of
+        its directions. A pair on the circle, as of a conservative system, counts as not stable."""
+        distances = jnp.abs(self.multipliers - 1.0)
+        nearest = jnp.argsort(jnp.argsort(distances, axis=-1), axis=-1)
+        # Round-off splits a double multiplier by the square root of its error.
+        is_own = (nearest < 2 * jnp.asarray(self.family)[..., None]) & (distances < math.sqrt(RANK))
+        return jnp.all(is_own | (jnp.abs(self.multipliers) < 1.0 - ON_CIRCLE), axis=-1)
 
     @property
     def status(self) -> str:
         """How the search has ended: "completed", or "unresolved" or "illegal" without an orbit."""
+        if np.ndim(self.reason):
+            raise ValueError("status is that of a single orbit; the orbits of a batch have `reason`, an array")
         reason = int(self.reason)
         return "illegal" if reason == len(REASONS) - 1 else "unresolved" if reason else "completed"
 
@@ -131,7 +146,7 @@ class Return(NamedTuple):
     - `time` [s], `state`: when and where, (cells,) and (components, cells); `rate`: of the state there.
     - `by_state`, `time_by_state`: derivatives by the start, (cells, components, components) and (cells, components);
       `by_numbers`, `time_by_numbers`: those by each other number, (cells, components) and (cells,).
-    - `in_motion`: whether it is not at a reset; `has_returned`; `is_home`: whether it ends in the mode of the start.
+    - `in_motion`: whether it is not at a reset; `reason`: as for `Orbit`, where there is no return.
     """
 
     time: Array
@@ -142,8 +157,7 @@ class Return(NamedTuple):
     by_numbers: list[Array]
     time_by_numbers: list[Array]
     in_motion: Array
-    has_returned: Array
-    is_home: Array
+    reason: Array
 
 
 class Newton(NamedTuple):
@@ -151,7 +165,7 @@ class Newton(NamedTuple):
 
     - `count`: number of returns so far; `state`: (components, cells); `is_done`, `is_finished`: whether all cells have
       converged, also at the finer tolerance; `reason`: as for `Orbit`, where the search has been given up; `iterations`.
-    - `in_motion`, `time`, `by_state`, `time_by_state`: of the last return; `inverse`: of 1 - J; `rank`: of 1 - J.
+    - `in_motion`, `time`, `by_state`, `time_by_state`: of the last return; `inverse`: of 1 - J.
     - `residual`, `step`: by how much the last return missed, and the length of the last step.
     """
 
@@ -166,7 +180,6 @@ class Newton(NamedTuple):
     by_state: Array
     time_by_state: Array
     inverse: Array
-    rank: Array
     residual: Array
     step: Array
 
@@ -177,7 +190,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
 
     - `movable`, `structures`, `rest`, `settings`, `unchecked`: as for `EventTime`, the horizon among the movable leaves.
     - `starts`: the leaves that are components of the start.
-    - `is_driven`: whether the period is given; `free`: the components that may change; `symmetry`: as for `periodic_orbit`.
+    - `is_driven`: whether the period is given; `free`: the components that may change; `has_symmetry`: whether the
+      parameters of the model contain a symmetry.
     - `with_multipliers`: whether the derivatives of the multipliers are computed.
     """
 
@@ -189,7 +203,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
     starts: tuple[int, ...] = eqx.field(static=True)
     is_driven: bool = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
-    symmetry: Any = eqx.field(static=True)
+    has_symmetry: bool = eqx.field(static=True)
     with_multipliers: bool = eqx.field(static=True, default=True)
 
     @classmethod
@@ -232,7 +246,16 @@ class OrbitSolve(AbstractDifferentiableSolve):
         model = self.model(leaves)
         parts = model.read(tuple(model.quantities), jnp.asarray(jnp.nan), rows, None)
         state = jnp.stack([parts[name] for name in model.quantities])
-        return state if self.symmetry is None or not mapped else jax.vmap(self.symmetry, -1, -1)(state)
+        if not (self.has_symmetry and mapped):
+            return state
+        form, values = model.parameters.form, model.parameters.values
+        axes = tuple(0 if jnp.ndim(value) else None for value in values)
+        return jax.vmap(lambda state, *values: form.tree(values)["symmetry"](state), (-1, *axes), -1)(state, *values)
+
+    @property
+    def moves(self) -> bool:
+        """Whether a start near the section is moved onto it."""
+        return not (self.is_driven or self.has_symmetry) and len(self.free) == len(self.starts)
 
     def at_section(self, mode: VariationalMode, state: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """By how much runs in a mode end before the section [s], and the states at the section, with their variations."""
@@ -276,14 +299,15 @@ class OrbitSolve(AbstractDifferentiableSolve):
         rows = jnp.reshape(ended.state, (1 + len(pairs), size + 1, cells))
         # A run that has ended at a reset which jumps over the zero is in no mode.
         point, slopes, mode = rows[0, :size], rows[1:], ended.mode % len(modes)
-        rate, in_motion = jnp.zeros_like(point), jnp.zeros(cells, bool)
+        rate, in_motion, at_edge = jnp.zeros_like(point), jnp.zeros(cells, bool), jnp.zeros(cells, bool)
         for number, of_mode in enumerate(modes):
             is_here, primal = ended.mode == number, of_mode.parts(ended.state)[0]
             (_, moved), (delays, changes) = self.at_section(of_mode, ended.state)
             problem = of_mode.mode.problem(primal[:-1])
             own_mode: Any = of_mode.mode
+            at_reset = is_here & on_margin(problem, primal[-1], primal[:-1])
+            at_edge |= at_reset | (is_here & (primal[-1] <= SAME * ended.end_time))
             if own_mode.margins and not self.is_driven:
-                at_reset = is_here & on_margin(problem, ended.end_time, primal[:-1])
                 through, *by = (dataclasses.replace(part, continues=True) for part in (own_mode, *of_mode.tangents))
                 onward = dataclasses.replace(of_mode, mode=through, tangents=tuple(by))
                 transition = onward.reset_map(ended.state.at[:size].set(moved), jnp.full(cells, jnp.inf))
@@ -298,11 +322,18 @@ class OrbitSolve(AbstractDifferentiableSolve):
         gathered = gather([(slope[-1], jnp.moveaxis(slope[:size], -1, 0)) for slope in slopes])
         point, changes, rate = self._in_components(leaves, active, point, [by[1].T for by in gathered], rate)
         count, delays = len(self.starts), [by[0] for by in gathered]
-        has_returned = ended.status == (REACHED_END if self.is_driven else CROSSED)
+        reason = jnp.where(mode == ensemble.first, 0, 2)
+        reason = jnp.where(ended.counts[-1] > 0, 7, reason)
+        reason = jnp.where(at_edge & self.is_driven, 8, reason)
+        has_failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
+        reason = jnp.where(
+            ended.status == (REACHED_END if self.is_driven else CROSSED), reason, 5 if self.is_driven else 1
+        )
+        reason = jnp.where(has_failed, 6, reason)
         by_state, time_by_state = jnp.stack(changes[:count], axis=-1), jnp.stack(delays[:count], axis=-1)
         derivatives = (by_state, time_by_state, changes[count:], delays[count:])
         time = ended.end_time if self.is_driven else ended.crossing_time
-        return Return(time, point, rate, *derivatives, in_motion, has_returned, mode == ensemble.first)
+        return Return(time, point, rate, *derivatives, in_motion, reason)
 
     def _in_components(
         self, leaves: tuple[Array, ...], active: tuple[int, ...], point: Array, changes: list[Array], rate: Array
@@ -322,20 +353,23 @@ class OrbitSolve(AbstractDifferentiableSolve):
         slopes = [push(change, *unit).T for change, unit in zip(changes, units, strict=True)]
         return state, slopes, push(rate, *still)
 
-    def on_section(self, leaves: tuple[Array, ...], cells: int, tolerance: Array, state: Array) -> tuple[Array, Array]:
-        """States moved along the motion onto a section nearby, and by how much [s]."""
-        total = jnp.zeros(cells)
+    def on_section(self, leaves: tuple[Array, ...], cells: int, state: Array) -> tuple[Array, Array, Array]:
+        """States moved along the motion onto a section nearby, by how much [s], and whether the event function falls there.
+        Where the function rises, the states stay."""
+        total, falls = jnp.zeros(cells), jnp.zeros(cells, bool)
         for _ in range(3):
             moved = self.with_start(leaves, state)
-            modes, first, states = self.model(moved).modes(cells, tolerance, (), False)
+            modes, first, states = self.model(moved).modes(cells, jnp.min(leaves[-1]), (), False)
             for number, mode in enumerate(modes):
                 problem = mode.problem(states)
                 rates = problem.field(jnp.zeros(cells), states)
                 value, rate = jax.jvp(problem.event_function, (states,), (rates,))
-                shift = jnp.where(first == number, -value / jnp.where(rate == 0.0, jnp.inf, rate), 0.0)
+                is_here = first == number
+                falls = jnp.where(is_here, rate < 0.0, falls)
+                shift = jnp.where(is_here & falls, -value / jnp.where(rate < 0.0, rate, -1.0), 0.0)
                 states, total = states + shift * rates, total + shift
             state = self.components(moved, states, mapped=False)
-        return state, total
+        return state, total, falls
 
     def newton(self, cells: int, leaves: tuple[Array, ...]) -> Newton:
         """Newton's iteration of all cells, from the starts."""
@@ -350,10 +384,11 @@ class OrbitSolve(AbstractDifferentiableSolve):
         def step(old: Newton) -> Newton:
             is_bad, state = old.reason > 0, old.state
             tolerance_now = jnp.where(old.is_done, finer, tolerance)
-            moved, shift = state, jnp.zeros(cells)
-            if not self.is_driven and self.symmetry is None:
-                moved, shift = self.on_section(leaves, cells, tolerance, state)
-                state = jnp.where(old.in_motion & ~is_bad, moved, state)
+            moved, shift, falls = state, jnp.zeros(cells), jnp.zeros(cells, bool)
+            if self.moves:
+                moved, shift, falls = self.on_section(leaves, cells, state)
+                is_near = falls & (jnp.abs(shift) < NEAR * old.time)
+                state = jnp.where(old.in_motion & is_near & ~is_bad, moved, state)
             left = jnp.where(is_bad, 0.0, t1)
             new = self.returned(self.with_start(leaves, state), cells, (), tolerance_now, left)
             miss = new.state - state
@@ -362,21 +397,25 @@ class OrbitSolve(AbstractDifferentiableSolve):
             left_vectors, values, right_vectors = jnp.linalg.svd(
                 jnp.where(is_sound[:, None, None], matrix, jnp.eye(size)[:, free]), full_matrices=False
             )
-            is_own = values > RANK * jnp.maximum(1.0, 1e-2 * values[:, :1])
+            is_own = is_regular(values)
             factors = jnp.where(is_own, 1.0 / jnp.where(is_own, values, 1.0), 0.0)
             inverse = jnp.einsum("ckf,ck,cnk->cfn", right_vectors, factors, left_vectors)
             change = jnp.zeros_like(state).at[free].set(jnp.einsum("cfn,nc->fc", inverse, miss))
-            # A guess is moved onto the section, unless the section is at a reset.
-            settles = (old.count == 0) & new.in_motion & (not self.is_driven)
-            is_near = (jnp.abs(shift) < NEAR * new.time) & (self.symmetry is None)
-            settled = jnp.where(is_near, moved, new.state)
-            scale = jnp.maximum(1.0, jnp.max(jnp.abs(state), axis=0))
-            residual = jnp.max(jnp.abs(miss), axis=0)
-            converged = ~settles & (residual <= CONVERGED * tolerance * scale)
+            # A guess is moved onto the section, unless the section is at a reset or a component is not free.
+            settles = (old.count == 0) & new.in_motion & (not self.is_driven) & (len(self.free) == size)
+            settled = jnp.where(falls & (jnp.abs(shift) < NEAR * new.time), moved, new.state)
+            # The size of the orbit: its state, or the radius of a circle with its speed and period.
+            extent = jnp.max(jnp.abs(new.rate), axis=0) * new.time
+            sizes = [jnp.max(jnp.abs(part), axis=0) for part in (state, new.state)]
+            scale = jnp.maximum(jnp.maximum(*sizes), extent / (2.0 * math.pi))
+            residual, length = (jnp.max(jnp.abs(part), axis=0) for part in (miss, change))
+            converged = residual <= CONVERGED * tolerance * scale
+            converged &= ~settles & (length <= jnp.sqrt(tolerance) * scale)
+            rests = extent <= CONVERGED * tolerance * jnp.maximum(scale, jnp.max(jnp.abs(start), axis=0))
             reason = jnp.where(is_sound, 0, 3)
             reason = jnp.where(~converged & (old.count >= MOST_NEWTON), 3, reason)
-            reason = jnp.where(new.is_home, reason, 2)
-            reason = jnp.where(is_bad, old.reason, jnp.where(new.has_returned, reason, 1))
+            reason = jnp.where(rests & new.in_motion & (not self.is_driven), 4, reason)
+            reason = jnp.where(is_bad, old.reason, jnp.where(new.reason > 0, new.reason, reason))
             following = jnp.where(settles, settled, state + change)
             return Newton(
                 old.count + 1,
@@ -390,15 +429,14 @@ class OrbitSolve(AbstractDifferentiableSolve):
                 new.by_state,
                 new.time_by_state,
                 inverse,
-                jnp.sum(is_own, axis=1),
                 residual,
-                jnp.max(jnp.abs(change), axis=0),
+                length,
             )
 
         false, zeros, whole = jnp.asarray(False), jnp.zeros(cells), jnp.zeros(cells, int)
         reason = jnp.where(is_legal, whole, len(REASONS) - 1)
         matrices = (jnp.zeros((cells, size, size)), jnp.zeros((cells, size)), jnp.zeros((cells, len(self.free), size)))
-        of_last = (jnp.zeros(cells, bool), zeros, *matrices, whole, zeros, zeros)
+        of_last = (jnp.zeros(cells, bool), zeros, *matrices, zeros, zeros)
         begin = Newton(jnp.zeros((), int), start, false, false, reason, whole, *of_last)
         return jax.lax.while_loop(lambda newton: ~newton.is_finished, step, begin)
 
@@ -411,7 +449,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
         order = jnp.argsort(-jnp.abs(values), axis=-1)
         values = jnp.take_along_axis(values, order, axis=-1)[:, : len(self.starts) - (not self.is_driven)]
         bound = jnp.maximum(SAFETY * found.step, 1e-14 * jnp.max(jnp.abs(found.state), axis=0))
-        counts = (len(self.free) - found.rank, found.iterations, found.reason)
+        singular = jnp.linalg.svd(jnp.eye(len(self.starts)) - found.by_state, compute_uv=False)
+        counts = (jnp.sum(~is_regular(singular), axis=1), found.iterations, found.reason)
         orbit = (found.time, found.state.T, values.real, values.imag, bound, found.residual)
         is_bad = found.reason > 0
         orbit = [jnp.where(is_bad.reshape(-1, *[1] * (part.ndim - 1)), jnp.nan, part) for part in orbit]
@@ -430,14 +469,28 @@ class OrbitSolve(AbstractDifferentiableSolve):
         last = self.returned(at_orbit, cells, others, finer, t1)
         by_numbers = dict(zip(others, zip(last.by_numbers, last.time_by_numbers, strict=True), strict=True))
         zeros, changes = jnp.zeros((cells, size)), {}
+        matrix = jnp.eye(size) - found.by_state
+        null = jnp.eye(len(self.free)) - found.inverse @ matrix[:, :, free]
+        is_family = jnp.trace(null, axis1=1, axis2=2) > 0.5
+        start = jnp.stack([jnp.broadcast_to(leaves[k], (cells,)) for k in self.starts])
+        distance, extent = (jnp.max(jnp.abs(part), axis=0) for part in (found.state - start, found.state))
+        is_vague = is_family & (distance > SAME_ORBIT * extent)
         for k in active:
             fixed, (by, delay) = zeros, by_numbers.get(k, (zeros, jnp.zeros(cells)))
             if k == 0 and self.is_driven:
                 by, delay = last.rate.T, jnp.ones(cells)
             elif k in self.starts and self.starts.index(k) not in self.free:
                 fixed = fixed.at[:, self.starts.index(k)].set(1.0)
-                by = jnp.einsum("cij,cj->ci", last.by_state, fixed) - fixed
-            change = fixed.at[:, free].add(jnp.einsum("cfn,cn->cf", found.inverse, by))
+            elif k in self.starts:
+                # The start is moved onto the section, and to the nearest orbit of a family.
+                fixed = jnp.where(is_family[:, None], self._start_slope(at_orbit, cells, found, k), 0.0)
+            push = by - jnp.einsum("cij,cj->ci", matrix, fixed)
+            change = fixed.at[:, free].add(jnp.einsum("cfn,cn->cf", found.inverse, push))
+            # There is no derivative if no orbit follows the number.
+            back = jnp.einsum("cij,cj->ci", matrix, change)
+            sizes = jnp.max(jnp.abs(by) + jnp.abs(change) + jnp.abs(back), axis=1)
+            is_lost = is_vague | (jnp.max(jnp.abs(by - back), axis=1) > SAME_ORBIT * sizes)
+            change = jnp.where(is_lost[:, None], jnp.nan, change)
             changes[k] = (delay + jnp.einsum("cn,cn->c", last.time_by_state, change), change)
         values = self.parts_of(found)
         multipliers = [(None, None)] * len(active)
@@ -445,6 +498,14 @@ class OrbitSolve(AbstractDifferentiableSolve):
             multipliers = self._multiplier_slopes(active, cells, at_orbit, values[2] + 1j * values[3], changes)
         slopes = [(*changes[k], *pair, *[None] * (PARTS - 4)) for k, pair in zip(active, multipliers, strict=True)]
         return values, slopes
+
+    def _start_slope(self, leaves: tuple[Array, ...], cells: int, found: Newton, k: int) -> Array:
+        """The derivative by a start of the state on the section to which it is moved, (cells, components)."""
+        unit = jnp.zeros_like(found.state).at[self.starts.index(k)].set(1.0)
+        if not self.moves:
+            return unit.T
+        _, moved = jax.jvp(lambda state: self.on_section(leaves, cells, state)[0], (found.state,), (unit,))
+        return jnp.where(found.in_motion, moved, unit).T
 
     def _multiplier_slopes(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], values: Array, changes: dict[int, Any]
@@ -455,9 +516,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
             blocks = jnp.broadcast_to(leaf, (len(active), len(STENCIL), cells))
             for row, number in enumerate(active):
                 size = STENCIL_STEP * tangent_scale(leaves[number])
-                by = 1.0 if k == number else changes[number][1][:, self.starts.index(k)] if k in self.starts else 0.0
-                if k in self.starts and k == number:
-                    by = changes[number][1][:, self.starts.index(k)]
+                by = changes[number][1][:, self.starts.index(k)] if k in self.starts else float(k == number)
                 steps = [place * size * by for place, _ in STENCIL]
                 blocks = blocks.at[row].add(jnp.stack([jnp.broadcast_to(step, (cells,)) for step in steps]))
             moved.append(blocks.reshape(-1))
@@ -475,10 +534,20 @@ class OrbitSolve(AbstractDifferentiableSolve):
         return slopes
 
 
+def is_regular(values: Float[Array, "cells values"]) -> Bool[Array, "cells values"]:
+    """Which singular values of 1 - J, the largest first, belong to no family."""
+    return values > RANK * jnp.maximum(1.0, 1e-2 * values[:, :1])
+
+
+def depth(part: Any) -> int:
+    """The number of axes of a start, which may consist of lists with traced numbers."""
+    return 1 + max(map(depth, part), default=0) if isinstance(part, list | tuple) else np.ndim(part)
+
+
 def is_several(start: Any) -> bool:
     """Whether a start consists of several guesses."""
-    is_pair = isinstance(start, tuple) and len(start) == 2 and all(np.ndim(part) == 2 for part in start)
-    return is_pair or (not isinstance(start, tuple) and np.ndim(start) == 2)
+    is_pair = isinstance(start, tuple) and len(start) == 2 and all(depth(part) == 2 for part in start)
+    return is_pair or (not isinstance(start, tuple) and depth(start) == 2)
 
 
 def distinct_orbits(system: object, guesses: Any, event: Any, options: dict[str, Any]) -> list[Orbit]:
@@ -515,11 +584,12 @@ def periodic_orbit(
     The return map leads from a state to the state at the next crossing of a section, where an event function falls through
     zero, or after a given period. If the section is at a reset, the state is that after the reset. The map's Jacobian is exact,
     also through resets. The derivatives of the period, the state and the multipliers with respect to every parameter use the
-    implicit function theorem; those of the multipliers are differences of exact derivatives at neighbouring orbits, with about
-    eight correct digits.
+    implicit function theorem; those of the multipliers are differences of exact derivatives at neighbouring orbits, with errors
+    of about 1000 times the tolerance.
 
     If a quantity is conserved or the motion can be shifted, orbits form families, and Newton's method takes the shortest step,
-    to an orbit of the family near the guess.
+    to an orbit of the family near the guess. Derivatives, also by the start, are then those at a start on an orbit, such as the
+    `state` of an `Orbit`, and NaN for other starts.
 
     **Arguments:**
 
@@ -528,7 +598,8 @@ def periodic_orbit(
       (guesses, components), or twice (guesses, coordinates) for an `AbstractSystem`.
     - `event`, `direction`: the section, as for `crossings`; by default the event of the `Hybrid`.
     - `period`: the period [s] of a driven system, in place of a section. The drive begins at time 0.
-    - `free`: names of the components that Newton's method changes, such as `["y0"]`; by default all.
+    - `free`: names of the components that Newton's method changes, such as `["y0"]`; by default all. The
+      others must be those of an orbit: a guess that is off the section is only moved onto it if all are free.
     - `symmetry`: function of the state at a return that maps it to the start of the next period, for orbits that repeat up to a
       shift or a reflection.
     - `t1`: longest time [s] until a return.
@@ -581,8 +652,16 @@ def periodic_orbit(
     unknown = [name for name in free or () if name not in names]
     if unknown or (free is not None and (isinstance(free, str) or not len(free))):
         raise ValueError(f"free = {shown(free)} must be a list of some of {', '.join(names)}")
+    if symmetry is not None:
+        state = jnp.zeros(len(names))
+        with named_errors("symmetry(y)", f"a state of {len(names)} components"):
+            mapped = with_own_numbers(symmetry, state)
+            shape = jax.eval_shape(mapped, state)
+        if getattr(shape, "shape", None) != state.shape:
+            raise ValueError(f"symmetry(y) must return a state of {len(names)} components, not {described(shape)}")
+        model = type(model).of(model.parameters.tree | {"symmetry": mapped})
     places = tuple(k for k, name in enumerate(names) if free is None or name in free)
-    options = (period is not None, places, symmetry)
+    options = (period is not None, places, symmetry is not None)
     settings = settings_for_lanes(tolerance, solver)
     time, state, *parts = differentiable_solve(*OrbitSolve.of(model, as_number(horizon), settings, *options))
     real, imaginary, error, residual, *counts = parts
