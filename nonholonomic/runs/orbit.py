@@ -60,7 +60,7 @@ REASONS = (
     "",
     "the run from there ends, or does not cross the section again within t1 = {t1:.6g} s",
     "the return from there ends in another mode than the first",
-    "a return from there still misses it by {residual:.2g} after {steps} Newton steps",
+    "a return from there still misses it by {residual:.2g}{hint}",
     "the state is an equilibrium",
     "the run from there ends before the period",
     "the integration of the run from there fails",
@@ -107,8 +107,8 @@ class Orbit(eqx.Module):
 
     @property
     def stable(self) -> Bool[Array, "..."]:
-        """Whether all multipliers lie inside the unit circle, apart from those of a family, which are 1: at most two for each of
-        its directions. A pair on the circle, as of a conservative system, counts as not stable."""
+        """Whether all multipliers lie inside the unit circle, apart from those of a family, which are 1: at most two
+        for each direction. A pair on the circle, as of a conservative system, counts as not stable."""
         distances = jnp.abs(self.multipliers - 1.0)
         nearest = jnp.argsort(jnp.argsort(distances, axis=-1), axis=-1)
         # Round-off splits a double multiplier by the square root of its error.
@@ -225,9 +225,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
 
     def for_parts(self, wanted: tuple[int, ...]) -> "OrbitSolve":
         # The real and the imaginary parts of the multipliers.
-        return dataclasses.replace(
-            self, with_multipliers=any(part % PARTS in (2, 3) for part in wanted if part >= PARTS)
-        )
+        is_wanted = any(part % PARTS in (2, 3) for part in wanted if part >= PARTS)
+        return dataclasses.replace(self, with_multipliers=is_wanted)
 
     def model(self, leaves: Sequence[Array]) -> AbstractModel:
         """The model of the leaves."""
@@ -251,11 +250,6 @@ class OrbitSolve(AbstractDifferentiableSolve):
         form, values = model.parameters.form, model.parameters.values
         axes = tuple(0 if jnp.ndim(value) else None for value in values)
         return jax.vmap(lambda state, *values: form.tree(values)["symmetry"](state), (-1, *axes), -1)(state, *values)
-
-    @property
-    def moves(self) -> bool:
-        """Whether a start near the section is moved onto it."""
-        return not (self.is_driven or self.has_symmetry) and len(self.free) == len(self.starts)
 
     def at_section(self, mode: VariationalMode, state: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """By how much runs in a mode end before the section [s], and the states at the section, with their variations."""
@@ -322,14 +316,10 @@ class OrbitSolve(AbstractDifferentiableSolve):
         gathered = gather([(slope[-1], jnp.moveaxis(slope[:size], -1, 0)) for slope in slopes])
         point, changes, rate = self._in_components(leaves, active, point, [by[1].T for by in gathered], rate)
         count, delays = len(self.starts), [by[0] for by in gathered]
-        reason = jnp.where(mode == ensemble.first, 0, 2)
-        reason = jnp.where(ended.counts[-1] > 0, 7, reason)
-        reason = jnp.where(at_edge & self.is_driven, 8, reason)
+        wanted, missing = (REACHED_END, 5) if self.is_driven else (CROSSED, 1)
         has_failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
-        reason = jnp.where(
-            ended.status == (REACHED_END if self.is_driven else CROSSED), reason, 5 if self.is_driven else 1
-        )
-        reason = jnp.where(has_failed, 6, reason)
+        faults = [has_failed, ended.status != wanted, at_edge & self.is_driven, ended.counts[-1] > 0]
+        reason = jnp.select([*faults, mode != ensemble.first], [6, missing, 8, 7, 2], 0)
         by_state, time_by_state = jnp.stack(changes[:count], axis=-1), jnp.stack(delays[:count], axis=-1)
         derivatives = (by_state, time_by_state, changes[count:], delays[count:])
         time = ended.end_time if self.is_driven else ended.crossing_time
@@ -357,7 +347,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
         """States moved along the motion onto a section nearby, by how much [s], and whether the event function falls there.
         Where the function rises, the states stay."""
         total, falls = jnp.zeros(cells), jnp.zeros(cells, bool)
-        for _ in range(3):
+        # With a component that is not free, a start must be on the section.
+        has_section = not (self.is_driven or self.has_symmetry) and len(self.free) == len(self.starts)
+        for _ in range(3 * has_section):
             moved = self.with_start(leaves, state)
             modes, first, states = self.model(moved).modes(cells, jnp.min(leaves[-1]), (), False)
             for number, mode in enumerate(modes):
@@ -384,11 +376,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
         def step(old: Newton) -> Newton:
             is_bad, state = old.reason > 0, old.state
             tolerance_now = jnp.where(old.is_done, finer, tolerance)
-            moved, shift, falls = state, jnp.zeros(cells), jnp.zeros(cells, bool)
-            if self.moves:
-                moved, shift, falls = self.on_section(leaves, cells, state)
-                is_near = falls & (jnp.abs(shift) < NEAR * old.time)
-                state = jnp.where(old.in_motion & is_near & ~is_bad, moved, state)
+            moved, shift, falls = self.on_section(leaves, cells, state)
+            is_near = falls & (jnp.abs(shift) < NEAR * old.time)
+            state = jnp.where(old.in_motion & is_near & ~is_bad, moved, state)
             left = jnp.where(is_bad, 0.0, t1)
             new = self.returned(self.with_start(leaves, state), cells, (), tolerance_now, left)
             miss = new.state - state
@@ -412,10 +402,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
             converged = residual <= CONVERGED * tolerance * scale
             converged &= ~settles & (length <= jnp.sqrt(tolerance) * scale)
             rests = extent <= CONVERGED * tolerance * jnp.maximum(scale, jnp.max(jnp.abs(start), axis=0))
-            reason = jnp.where(is_sound, 0, 3)
-            reason = jnp.where(~converged & (old.count >= MOST_NEWTON), 3, reason)
-            reason = jnp.where(rests & new.in_motion & (not self.is_driven), 4, reason)
-            reason = jnp.where(is_bad, old.reason, jnp.where(new.reason > 0, new.reason, reason))
+            rests &= new.in_motion & (not self.is_driven)
+            misses = ~is_sound | (~converged & (old.count >= MOST_NEWTON))
+            reason = jnp.select([is_bad, new.reason > 0, rests, misses], [old.reason, new.reason, 4, 3], 0)
             following = jnp.where(settles, settled, state + change)
             return Newton(
                 old.count + 1,
@@ -429,7 +418,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
                 new.by_state,
                 new.time_by_state,
                 inverse,
-                residual,
+                jnp.where(is_bad, old.residual, residual),
                 length,
             )
 
@@ -451,10 +440,10 @@ class OrbitSolve(AbstractDifferentiableSolve):
         bound = jnp.maximum(SAFETY * found.step, 1e-14 * jnp.max(jnp.abs(found.state), axis=0))
         singular = jnp.linalg.svd(jnp.eye(len(self.starts)) - found.by_state, compute_uv=False)
         counts = (jnp.sum(~is_regular(singular), axis=1), found.iterations, found.reason)
-        orbit = (found.time, found.state.T, values.real, values.imag, bound, found.residual)
+        orbit = (found.time, found.state.T, values.real, values.imag, bound)
         is_bad = found.reason > 0
         orbit = [jnp.where(is_bad.reshape(-1, *[1] * (part.ndim - 1)), jnp.nan, part) for part in orbit]
-        return (*orbit, *(count.astype(float) for count in counts))
+        return (*orbit, found.residual, *(count.astype(float) for count in counts))
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
@@ -469,6 +458,10 @@ class OrbitSolve(AbstractDifferentiableSolve):
         last = self.returned(at_orbit, cells, others, finer, t1)
         by_numbers = dict(zip(others, zip(last.by_numbers, last.time_by_numbers, strict=True), strict=True))
         zeros, changes = jnp.zeros((cells, size)), {}
+
+        def onto(state: Array) -> Array:
+            return self.on_section(leaves, cells, state)[0]
+
         matrix = jnp.eye(size) - found.by_state
         null = jnp.eye(len(self.free)) - found.inverse @ matrix[:, :, free]
         is_family = jnp.trace(null, axis1=1, axis2=2) > 0.5
@@ -479,16 +472,17 @@ class OrbitSolve(AbstractDifferentiableSolve):
             fixed, (by, delay) = zeros, by_numbers.get(k, (zeros, jnp.zeros(cells)))
             if k == 0 and self.is_driven:
                 by, delay = last.rate.T, jnp.ones(cells)
-            elif k in self.starts and self.starts.index(k) not in self.free:
-                fixed = fixed.at[:, self.starts.index(k)].set(1.0)
             elif k in self.starts:
                 # The start is moved onto the section, and to the nearest orbit of a family.
-                fixed = jnp.where(is_family[:, None], self._start_slope(at_orbit, cells, found, k), 0.0)
+                place = self.starts.index(k)
+                unit = zeros.T.at[place].set(1.0)
+                on_section = jnp.where(found.in_motion, jax.jvp(onto, (found.state,), (unit,))[1], unit)
+                fixed = jnp.where(is_family[:, None] | (place not in self.free), on_section.T, 0.0)
             push = by - jnp.einsum("cij,cj->ci", matrix, fixed)
             change = fixed.at[:, free].add(jnp.einsum("cfn,cn->cf", found.inverse, push))
             # There is no derivative if no orbit follows the number.
             back = jnp.einsum("cij,cj->ci", matrix, change)
-            sizes = jnp.max(jnp.abs(by) + jnp.abs(change) + jnp.abs(back), axis=1)
+            sizes = jnp.max(jnp.abs(by) + jnp.abs(change), axis=1) + extent / tangent_scale(leaves[k])
             is_lost = is_vague | (jnp.max(jnp.abs(by - back), axis=1) > SAME_ORBIT * sizes)
             change = jnp.where(is_lost[:, None], jnp.nan, change)
             changes[k] = (delay + jnp.einsum("cn,cn->c", last.time_by_state, change), change)
@@ -498,14 +492,6 @@ class OrbitSolve(AbstractDifferentiableSolve):
             multipliers = self._multiplier_slopes(active, cells, at_orbit, values[2] + 1j * values[3], changes)
         slopes = [(*changes[k], *pair, *[None] * (PARTS - 4)) for k, pair in zip(active, multipliers, strict=True)]
         return values, slopes
-
-    def _start_slope(self, leaves: tuple[Array, ...], cells: int, found: Newton, k: int) -> Array:
-        """The derivative by a start of the state on the section to which it is moved, (cells, components)."""
-        unit = jnp.zeros_like(found.state).at[self.starts.index(k)].set(1.0)
-        if not self.moves:
-            return unit.T
-        _, moved = jax.jvp(lambda state: self.on_section(leaves, cells, state)[0], (found.state,), (unit,))
-        return jnp.where(found.in_motion, moved, unit).T
 
     def _multiplier_slopes(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], values: Array, changes: dict[int, Any]
@@ -668,6 +654,7 @@ def periodic_orbit(
     family, iterations, reason = (jnp.asarray(count).astype(int) for count in counts)
     orbit = Orbit(time, state, real + 1j * imaginary, error, residual, family, iterations, reason, names)
     if not is_traced(reason) and np.ndim(reason) == 0 and int(reason):
-        why = REASONS[int(reason)].format(t1=t1, residual=float(residual), steps=int(iterations))
+        hint = "" if free is None else "; the components that are not free must be those of an orbit, on the section"
+        why = REASONS[int(reason)].format(t1=t1, residual=float(residual), hint=hint)
         raise ValueError(f"start: no periodic orbit was found: after {int(iterations)} Newton steps, {why}")
     return orbit
