@@ -299,7 +299,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
             (_, moved), (delays, changes) = self.at_section(of_mode, ended.state)
             problem = of_mode.mode.problem(primal[:-1])
             own_mode: Any = of_mode.mode
-            at_reset = is_here & on_margin(problem, primal[-1], primal[:-1])
+            at_reset = is_here & on_margin(problem, primal[-1], moved)
             at_edge |= at_reset | (is_here & (primal[-1] <= SAME * ended.end_time))
             if own_mode.margins and not self.is_driven:
                 through, *by = (dataclasses.replace(part, continues=True) for part in (own_mode, *of_mode.tangents))
@@ -320,10 +320,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
         has_failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
         faults = [has_failed, ended.status != wanted, at_edge & self.is_driven, ended.counts[-1] > 0]
         reason = jnp.select([*faults, mode != ensemble.first], [6, missing, 8, 7, 2], 0)
-        by_state, time_by_state = jnp.stack(changes[:count], axis=-1), jnp.stack(delays[:count], axis=-1)
-        derivatives = (by_state, time_by_state, changes[count:], delays[count:])
+        by_start = [jnp.stack(parts[:count], axis=-1) for parts in (changes, delays)]
         time = ended.end_time if self.is_driven else ended.crossing_time
-        return Return(time, point, rate, *derivatives, in_motion, reason)
+        return Return(time, point, rate, *by_start, changes[count:], delays[count:], in_motion, reason)
 
     def _in_components(
         self, leaves: tuple[Array, ...], active: tuple[int, ...], point: Array, changes: list[Array], rate: Array
@@ -396,9 +395,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
             settled = jnp.where(falls & (jnp.abs(shift) < NEAR * new.time), moved, new.state)
             # The size of the orbit: its state, or the radius of a circle with its speed and period.
             extent = jnp.max(jnp.abs(new.rate), axis=0) * new.time
-            sizes = [jnp.max(jnp.abs(part), axis=0) for part in (state, new.state)]
+            parts = (state, new.state, miss, change)
+            *sizes, residual, length = (jnp.max(jnp.abs(part), axis=0) for part in parts)
             scale = jnp.maximum(jnp.maximum(*sizes), extent / (2.0 * math.pi))
-            residual, length = (jnp.max(jnp.abs(part), axis=0) for part in (miss, change))
             converged = residual <= CONVERGED * tolerance * scale
             converged &= ~settles & (length <= jnp.sqrt(tolerance) * scale)
             rests = extent <= CONVERGED * tolerance * jnp.maximum(scale, jnp.max(jnp.abs(start), axis=0))
@@ -441,8 +440,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
         singular = jnp.linalg.svd(jnp.eye(len(self.starts)) - found.by_state, compute_uv=False)
         counts = (jnp.sum(~is_regular(singular), axis=1), found.iterations, found.reason)
         orbit = (found.time, found.state.T, values.real, values.imag, bound)
-        is_bad = found.reason > 0
-        orbit = [jnp.where(is_bad.reshape(-1, *[1] * (part.ndim - 1)), jnp.nan, part) for part in orbit]
+        orbit = [jnp.where(found.reason.reshape(-1, *[1] * (part.ndim - 1)) > 0, jnp.nan, part) for part in orbit]
         return (*orbit, found.residual, *(count.astype(float) for count in counts))
 
     def value_and_tangents(
@@ -457,14 +455,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
         finer = jnp.maximum(jnp.min(leaves[-1]) / FINER, TIGHTEST)
         last = self.returned(at_orbit, cells, others, finer, t1)
         by_numbers = dict(zip(others, zip(last.by_numbers, last.time_by_numbers, strict=True), strict=True))
-        zeros, changes = jnp.zeros((cells, size)), {}
-
-        def onto(state: Array) -> Array:
-            return self.on_section(leaves, cells, state)[0]
-
-        matrix = jnp.eye(size) - found.by_state
-        null = jnp.eye(len(self.free)) - found.inverse @ matrix[:, :, free]
-        is_family = jnp.trace(null, axis1=1, axis2=2) > 0.5
+        zeros, changes, matrix = jnp.zeros((cells, size)), {}, jnp.eye(size) - found.by_state
+        is_family = jnp.trace(found.inverse @ matrix[:, :, free], axis1=1, axis2=2) < len(self.free) - 0.5
         start = jnp.stack([jnp.broadcast_to(leaves[k], (cells,)) for k in self.starts])
         distance, extent = (jnp.max(jnp.abs(part), axis=0) for part in (found.state - start, found.state))
         is_vague = is_family & (distance > SAME_ORBIT * extent)
@@ -476,8 +468,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
                 # The start is moved onto the section, and to the nearest orbit of a family.
                 place = self.starts.index(k)
                 unit = zeros.T.at[place].set(1.0)
-                on_section = jnp.where(found.in_motion, jax.jvp(onto, (found.state,), (unit,))[1], unit)
-                fixed = jnp.where(is_family[:, None] | (place not in self.free), on_section.T, 0.0)
+                _, moved = jax.jvp(lambda state: self.on_section(leaves, cells, state)[0], (found.state,), (unit,))
+                moved = jnp.where(found.in_motion, moved, unit).T
+                fixed = jnp.where(is_family[:, None] | (place not in self.free), moved, 0.0)
             push = by - jnp.einsum("cij,cj->ci", matrix, fixed)
             change = fixed.at[:, free].add(jnp.einsum("cfn,cn->cf", found.inverse, push))
             # There is no derivative if no orbit follows the number.
@@ -512,12 +505,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
         places = jnp.argmin(jnp.abs(near[..., None, :] - values[:, :, None]), axis=-1)
         near = jnp.take_along_axis(near, places, axis=-1)
         weights = jnp.array([weight for _, weight in STENCIL])
-        slopes = []
-        for row, number in enumerate(active):
-            size = jnp.broadcast_to(STENCIL_STEP * tangent_scale(leaves[number]), (cells,))
-            slope = jnp.einsum("s,scm->cm", weights, near[row]) / (12.0 * size[:, None])
-            slopes.append((slope.real, slope.imag))
-        return slopes
+        sizes = jnp.stack([jnp.broadcast_to(STENCIL_STEP * tangent_scale(leaves[k]), (cells,)) for k in active])
+        slopes = jnp.einsum("s,rscm->rcm", weights, near) / (12.0 * sizes[:, :, None])
+        return [(slope.real, slope.imag) for slope in slopes]
 
 
 def is_regular(values: Float[Array, "cells values"]) -> Bool[Array, "cells values"]:
@@ -654,7 +644,9 @@ def periodic_orbit(
     family, iterations, reason = (jnp.asarray(count).astype(int) for count in counts)
     orbit = Orbit(time, state, real + 1j * imaginary, error, residual, family, iterations, reason, names)
     if not is_traced(reason) and np.ndim(reason) == 0 and int(reason):
-        hint = "" if free is None else "; the components that are not free must be those of an orbit, on the section"
+        hint = "" if period is None or model.smooth else "; a reset near the end of the period has such an effect"
+        if free is not None:
+            hint = "; the components that are not free must be those of an orbit, on the section"
         why = REASONS[int(reason)].format(t1=t1, residual=float(residual), hint=hint)
         raise ValueError(f"start: no periodic orbit was found: after {int(iterations)} Newton steps, {why}")
     return orbit
