@@ -299,7 +299,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
             (_, moved), (delays, changes) = self.at_section(of_mode, ended.state)
             problem = of_mode.mode.problem(primal[:-1])
             own_mode: Any = of_mode.mode
-            at_reset = is_here & on_margin(problem, primal[-1], moved)
+            # A run that ends in a reset map has no time in a mode.
+            in_mode = jnp.where(primal[-1] > 0.0, primal[-1], ended.end_time)
+            at_reset = is_here & on_margin(problem, in_mode, moved)
             at_edge |= at_reset | (is_here & (primal[-1] <= SAME * ended.end_time))
             if own_mode.margins and not self.is_driven:
                 through, *by = (dataclasses.replace(part, continues=True) for part in (own_mode, *of_mode.tangents))

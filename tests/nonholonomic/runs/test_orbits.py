@@ -55,6 +55,17 @@ def test_an_orbit_through_a_reset_and_its_derivatives():
     np.testing.assert_allclose(batch, [kicked(0.1, one) for one in restitutions], rtol=1e-11)
 
 
+def test_an_illegal_number_in_a_program_and_a_list_with_a_traced_number():
+    def orbit(speed, tolerance):
+        return periodic_orbit(Hybrid([Kicked(0.1, 0.4)]), [0.0, speed], wall, tolerance=tolerance)
+
+    batch = jax.jit(jax.vmap(orbit))(jnp.array([0.8, 0.8]), jnp.array([1e-10, -1.0]))
+    np.testing.assert_allclose(batch.state[:, 1], [kicked(0.1, 0.4)[1], np.nan], rtol=1e-11)
+    assert [int(batch.reason[0]), jax.tree.map(lambda part: part[1], batch).status] == [0, "illegal"]
+    with pytest.raises(ValueError, match="a batch have `reason`"):
+        _ = batch.status
+
+
 class Walker(AbstractMode):
     """The simplest walker: angles of the stance leg and of the hip, and their rates (Garcia et al. 1998)."""
 
@@ -131,6 +142,11 @@ def test_a_driven_oscillator_and_its_derivatives_by_the_frequency():
 
     values, slopes = orbit(1.3), jax.jacfwd(orbit)(1.3)
     np.testing.assert_allclose(values, exact(1.3), atol=1e-12)
+    for tolerance in (1e-5, 1e-7, 1e-9):
+        rough = periodic_orbit(Hybrid([Driven(0.2, 1.3)]), [0.0, 0.0], period=2.0 * np.pi / 1.3, tolerance=tolerance)
+        errors = np.abs(rough.state - exact(1.3)[:2])
+        assert np.all(errors <= rough.error)
+        assert rough.error < 1e3 * tolerance
     np.testing.assert_allclose(slopes, jax.jacfwd(exact)(1.3), atol=1e-8)
 
 
@@ -174,6 +190,9 @@ def test_a_ball_on_a_vibrating_table():
     np.testing.assert_allclose(orbit.state, [apex, 0.0], atol=1e-11)
     np.testing.assert_allclose(np.sort_complex(orbit.multipliers), np.sort_complex(expected), atol=1e-8)
     assert orbit.stable == (max(abs(expected)) < 1.0)
+    just_after = [amplitude * np.sin(phase), speed]
+    with pytest.raises(ValueError, match="a reset falls on the end of the period; shift the phase"):
+        periodic_orbit(Hybrid([Table(amplitude, frequency, restitution, phase)]), just_after, period=period)
 
 
 class Pendulum(AbstractSystem):
@@ -200,6 +219,21 @@ def test_an_orbit_of_a_family():
     assert orbit.stable
     assert "family" in repr(orbit)
 
+    # Two multipliers 1 of one family of driven orbits, split by round-off.
+    driven = periodic_orbit(Pendulum(), ([1.0], [0.0]), period=float(orbit.period))
+    assert driven.family == 1
+    assert driven.stable
+
+
+def test_derivatives_of_a_family_by_the_start_and_a_number():
+    def period(angle, length):
+        start = ([angle], [0.0 * angle])
+        return periodic_orbit(Pendulum(length), start, turning).period
+
+    slopes = jax.jit(jax.grad(period, (0, 1)))(1.0, 1.0)
+    exact = [4.0 * np.sqrt(1.0 / GRAVITY) * ellipk(np.sin(0.5 * angle) ** 2) for angle in (0.999, 1.0, 1.001)]
+    np.testing.assert_allclose(slopes, [(exact[2] - exact[0]) / 0.002, 0.5 * exact[1]], rtol=1e-6)
+
 
 class Rotor(AbstractMode):
     """A rotor that approaches the speed of its motor."""
@@ -225,6 +259,20 @@ def test_an_orbit_up_to_a_symmetry():
     np.testing.assert_allclose(orbit.multipliers, [np.exp(-0.2 * 2.0 * np.pi / 3.0)], rtol=1e-9)
 
 
+def test_numbers_inside_a_symmetry():
+    def period(turns):
+        def shift(y):
+            return y - jnp.array([2.0 * jnp.pi * turns, 0.0])
+
+        return periodic_orbit(
+            Hybrid([Rotor(3.0)]), [0.0, 2.0], lambda t, y: turned(t, y / turns), symmetry=shift
+        ).period
+
+    np.testing.assert_allclose(jax.grad(period)(1.0), 2.0 * np.pi / 3.0, rtol=1e-9)
+    with pytest.raises(ValueError, match=r"symmetry\(y\) must return a state of 2 components"):
+        periodic_orbit(Hybrid([Rotor(3.0)]), [0.0, 2.0], turned, symmetry=lambda y: y[:1])
+
+
 class Radial(AbstractMode):
     """A rotation with limit cycles of the radii 1 and 2."""
 
@@ -232,6 +280,41 @@ class Radial(AbstractMode):
         square = jnp.sum(y**2)
         growth = 0.01 * (1.0 - square) * (4.0 - square)
         return jnp.array([growth * y[0] - y[1], y[0] + growth * y[1]])
+
+
+class Equilibrium(AbstractMode):
+    """A limit cycle of the radius `size` around the equilibrium 0, at any height."""
+
+    size: float = 1.0
+
+    def field(self, t, y):
+        growth = 0.1 * (1.0 - (y[0] ** 2 + y[1] ** 2) / self.size**2)
+        return jnp.array([growth * y[0] - y[1], y[0] + growth * y[1], 0.0 * y[2]])
+
+
+def rises(t, y):
+    return y[1]
+
+
+@pytest.mark.parametrize("options", [{}, {"free": ["y0"]}])
+def test_a_guess_where_the_section_is_crossed_the_other_way(options):
+    """The function rises at the first guess; with `free`, the guess is on the section, and the family is still found."""
+    start = [0.9, 0.0, 0.3] if options else [-0.9, 0.0, 0.3]
+    orbit = periodic_orbit(Hybrid([Equilibrium()]), start, rises, direction="rise", **options)
+    np.testing.assert_allclose(orbit.state, [1.0, 0.0, 0.3], atol=1e-11)
+    np.testing.assert_allclose(orbit.multipliers, [1.0, np.exp(-0.4 * np.pi)], atol=1e-9)
+    assert orbit.family == 1
+    assert orbit.stable
+
+
+def test_an_equilibrium_is_no_orbit_and_a_small_orbit_is_found():
+    system = Hybrid([Equilibrium()])
+    with pytest.raises(ValueError, match="the state is an equilibrium"):
+        periodic_orbit(system, [0.001, 0.0, 0.3], rises, direction="rise")
+    with pytest.raises(ValueError, match=r"misses it by 0\.01; the components that are not free"):
+        periodic_orbit(system, [0.9, 0.01, 0.3], rises, direction="rise", free=["y0"])
+    small = periodic_orbit(Hybrid([Equilibrium(1e-9)]), [0.7e-9, 0.0, 0.0], rises, direction="rise")
+    np.testing.assert_allclose(small.state[0], 1e-9, rtol=1e-10)
 
 
 def test_distinct_orbits_are_counted_once():
