@@ -242,7 +242,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
 
     def components(self, leaves: Sequence[Array], rows: Float[Array, "rows cells"], mapped: bool = True) -> Array:
         """States of the engine in the components of a start, (components, cells), by default mapped by the symmetry."""
-        model = self.model(leaves)
+        model: Any = self.model(leaves)
         parts = model.read(tuple(model.quantities), jnp.asarray(jnp.nan), rows, None)
         state = jnp.stack([parts[name] for name in model.quantities])
         if not (self.has_symmetry and mapped):
@@ -322,9 +322,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
         has_failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
         faults = [has_failed, ended.status != wanted, at_edge & self.is_driven, ended.counts[-1] > 0]
         reason = jnp.select([*faults, mode != ensemble.first], [6, missing, 8, 7, 2], 0)
-        by_start = [jnp.stack(parts[:count], axis=-1) for parts in (changes, delays)]
+        by_state, time_by_state = (jnp.stack(parts[:count], axis=-1) for parts in (changes, delays))
         time = ended.end_time if self.is_driven else ended.crossing_time
-        return Return(time, point, rate, *by_start, changes[count:], delays[count:], in_motion, reason)
+        return Return(time, point, rate, by_state, time_by_state, changes[count:], delays[count:], in_motion, reason)
 
     def _in_components(
         self, leaves: tuple[Array, ...], active: tuple[int, ...], point: Array, changes: list[Array], rate: Array
@@ -397,8 +397,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
             settled = jnp.where(falls & (jnp.abs(shift) < NEAR * new.time), moved, new.state)
             # The size of the orbit: its state, or the radius of a circle with its speed and period.
             extent = jnp.max(jnp.abs(new.rate), axis=0) * new.time
-            parts = (state, new.state, miss, change)
-            *sizes, residual, length = (jnp.max(jnp.abs(part), axis=0) for part in parts)
+            *sizes, residual, length = (jnp.max(jnp.abs(part), axis=0) for part in (state, new.state, miss, change))
             scale = jnp.maximum(jnp.maximum(*sizes), extent / (2.0 * math.pi))
             converged = residual <= CONVERGED * tolerance * scale
             converged &= ~settles & (length <= jnp.sqrt(tolerance) * scale)
@@ -522,7 +521,7 @@ def depth(part: Any) -> int:
     return 1 + max(map(depth, part), default=0) if isinstance(part, list | tuple) else np.ndim(part)
 
 
-def is_several(start: Any) -> bool:
+def is_several(start: object) -> bool:
     """Whether a start consists of several guesses."""
     is_pair = isinstance(start, tuple) and len(start) == 2 and all(depth(part) == 2 for part in start)
     return is_pair or (not isinstance(start, tuple) and depth(start) == 2)
@@ -576,8 +575,8 @@ def periodic_orbit(
       (guesses, components), or twice (guesses, coordinates) for an `AbstractSystem`.
     - `event`, `direction`: the section, as for `crossings`; by default the event of the `Hybrid`.
     - `period`: the period [s] of a driven system, in place of a section. The drive begins at time 0.
-    - `free`: names of the components that Newton's method changes, such as `["y0"]`; by default all. The
-      others must be those of an orbit: a guess that is off the section is only moved onto it if all are free.
+    - `free`: names of the components that Newton's method changes, such as `["y0"]`; by default all. The others must be
+      those of an orbit: a guess that is off the section is moved onto it only if all are free.
     - `symmetry`: function of the state at a return that maps it to the start of the next period, for orbits that repeat up to a
       shift or a reflection.
     - `t1`: longest time [s] until a return.
