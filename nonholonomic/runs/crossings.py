@@ -20,14 +20,14 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ..compilation.xla_cpu import compiled_alone, greatest, written_in_place
 from ..hybrid import MOST_ROUNDS
 from ..hybrid.ensemble import after_reset, after_solve, all_rounds, at_start, chosen, over_cells, selected_cells
-from ..integration import AbstractProblem, Lanes, LaneState, Settings, States
-from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, LEFT_DOMAIN, RUNNING, Status
+from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
+from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ..integration.scheduler import InLanes, LaneScheduler, Recorder, of_cells
 from ..integration.step import try_step
 from ..sweeps import Axis, Table, Variable
 from ..text import shown
 from ..validation import require_outside, require_whole
-from .event import modes_of, problem_of
+from .event import modes_of, near_zero, problem_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
 from .simulate import Samples, mode_at, own_axis
 from .sweep import Options, named_axes, require_names, table_of
@@ -40,10 +40,13 @@ SAME = 1e-9
 
 class Kept(NamedTuple):
     """What is kept of the crossings of every cell: the number so far, whether the last one is at the end of a mode whose reset
-    comes next, and of those that are asked for the times [s], the states and the modes, with the cells last."""
+    comes next, whether the last mode ended on the section or beyond, the number of resets since the last crossing, and of
+    those that are asked for the times [s], the states and the modes, with the cells last."""
 
     counted: Int[Array, " cells"]
     at_end: Bool[Array, " cells"]
+    beyond: Bool[Array, " cells"]
+    resets: Int[Array, " cells"]
     time: Float[Array, "count cells"]
     state: Float[Array, "components count cells"]
     mode: Int[Array, "count cells"]
@@ -52,12 +55,14 @@ class Kept(NamedTuple):
 class CrossingRecorder(Recorder):
     """Keeps the crossings inside the steps of every cell, and ends a run at the last one that is asked for.
 
-    `skip`, `count`: as for `crossings`; `begin_time`: when each cell began [s]; `number`: the index of its mode.
+    `skip`, `count`: as for `crossings`; `begin_time`: when each cell began [s]; `leaves`: up to when [s] a cell only leaves
+    the section, on which it began; `number`: the index of its mode.
     """
 
     skip: Int[Array, ""]
     count: int = eqx.field(static=True)
     begin_time: Float[Array, " cells"]
+    leaves: Float[Array, " cells"]
     number: int = eqx.field(static=True)
 
     period: ClassVar[int] = 64
@@ -72,6 +77,7 @@ class CrossingRecorder(Recorder):
     ) -> tuple[LaneState, PyTree]:
         (counted, rows, places), new = record, try_step(*in_lanes, lane_state)
         crosses = jnp.isfinite(new.crossing_time) & (new.crossing_time != lane_state.crossing_time)
+        crosses &= new.crossing_time > self.leaves[lane_state.cell]
         counted = counted + crosses
         # The step has ended just beyond the section.
         state = new.state + (new.crossing_time - new.time) * new.rate
@@ -84,12 +90,11 @@ class CrossingRecorder(Recorder):
     def collect(self, collected: Kept, record: PyTree, ended: LaneState, refilled: LaneState) -> Kept:
         (counted, rows, places), cell = record, ended.cell
         begin, cells = self.begin_time[cell], jnp.broadcast_to(cell, places.shape)
-        return Kept(
-            collected.counted.at[cell].set(counted, mode="drop"),
-            collected.at_end,
-            collected.time.at[places, cells].set(begin + rows[:, -1], mode="drop"),
-            collected.state.at[:, places, cells].set(jnp.moveaxis(rows[:, :-1], 1, 0), mode="drop"),
-            collected.mode.at[places, cells].set(self.number, mode="drop"),
+        return collected._replace(
+            counted=collected.counted.at[cell].set(counted, mode="drop"),
+            time=collected.time.at[places, cells].set(begin + rows[:, -1], mode="drop"),
+            state=collected.state.at[:, places, cells].set(jnp.moveaxis(rows[:, :-1], 1, 0), mode="drop"),
+            mode=collected.mode.at[places, cells].set(self.number, mode="drop"),
         )
 
 
@@ -109,6 +114,11 @@ def on_margin(problem: AbstractProblem, time: Lanes, state: States) -> Bool[Arra
     return (slope < 0.0) & (value <= -slope * SAME * time)
 
 
+def on_section(problem: AbstractProblem, time: Lanes, state: States) -> tuple[Lanes, Lanes, Lanes]:
+    """The event function of runs that have spent some time [s] in a mode, as `near_zero` gives it."""
+    return near_zero(problem.event_function, state, problem.field(time, state), problem.start()[1])
+
+
 @compiled_alone
 def crossings_in_cells(
     model: AbstractModel,
@@ -123,19 +133,23 @@ def crossings_in_cells(
 ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
     """The `Status` of all cells, of which only the first `cells` are run, and the variables of the table."""
 
-    def followed(problem: AbstractProblem, t1: Array, kept: Kept, begin: Array, number: int, cells: Array) -> Any:
+    def followed(
+        problem: AbstractProblem, t1: Array, kept: Kept, begin: Array, leaves: Array, number: int, cells: Array
+    ) -> tuple[Outcome, Kept]:
         scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=True)
-        outcome, _, kept = scheduler.solve(CrossingRecorder(skip, count, begin, number), kept)
+        outcome, _, kept = scheduler.solve(CrossingRecorder(skip, count, begin, leaves, number), kept)
         return outcome, kept
 
     def start(components: int) -> Kept:
         never, none = jnp.full((count, size), jnp.nan), jnp.zeros((count, size), int)
         state = jnp.full((components, count, size), jnp.nan)
-        return Kept(jnp.zeros(size, int), jnp.zeros(size, bool), never, state, none)
+        zeros, false = jnp.zeros(size, int), jnp.zeros(size, bool)
+        return Kept(zeros, false, false, zeros, never, state, none)
 
     if model.smooth:
         problem = problem_of(model, size, names)
-        outcome, kept = followed(problem, t1, start(len(problem.start()[0])), jnp.zeros(size), 0, cells)
+        begin = jnp.zeros(size)
+        outcome, kept = followed(problem, t1, start(len(problem.start()[0])), begin, begin, 0, cells)
         rows, ended, counted = kept.state, outcome, ()
     else:
         modes, first, states = modes_of(model, size, settings.tolerance, names, True)
@@ -145,17 +159,23 @@ def crossings_in_cells(
             (runs, kept), cell = carry, selected_cells(active)
             left = jnp.where(active, greatest(horizon - runs.end_time, 0.0), 0.0)
             problem = of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
-            outcome, new = followed(problem, left, kept, runs.end_time, numbers[0], jnp.asarray(size))
+            value, slope, error = on_section(problem, jnp.zeros(size), problem.start()[0])
+            is_on = kept.beyond & (jnp.abs(value) <= error) & (slope < 0.0)
+            leaves = jnp.where(is_on, -2.0 * value / jnp.where(is_on, slope, 1.0), -jnp.inf)
+            outcome, new = followed(problem, left, kept, runs.end_time, leaves, numbers[0], jnp.asarray(size))
             if after:
                 is_reset = (outcome.status == CROSSED) & on_margin(problem, outcome.end_time, outcome.state)
                 shift = jnp.where(is_reset, outcome.crossing_time - outcome.end_time, 0.0)
                 moved = outcome.state + shift * problem.field(outcome.end_time, outcome.state)
                 status = jnp.where(is_reset, LEFT_DOMAIN, outcome.status)
                 outcome = outcome._replace(status=status, end_time=outcome.end_time + shift, state=moved)
+            value, _, error = on_section(problem, outcome.end_time, outcome.state)
             at_end = (outcome.end_time - outcome.crossing_time <= SAME * outcome.end_time) & jnp.isfinite(
                 outcome.crossing_time
             )
-            new = new._replace(at_end=at_end & (outcome.status == LEFT_DOMAIN))
+            at_end &= (outcome.crossing_time > leaves) & (outcome.status == LEFT_DOMAIN)
+            resets = jnp.where(new.counted > kept.counted, 0, kept.resets)
+            new = new._replace(at_end=at_end, beyond=value <= error, resets=resets)
             advanced = (after_solve(runs, outcome, horizon), new)
             return jax.tree.map(functools.partial(jnp.where, active), advanced, carry)
 
@@ -163,29 +183,31 @@ def crossings_in_cells(
             (runs, kept), cell = carry, selected_cells(lost)
             left = greatest(horizon[cell] - runs.end_time[cell], 0.0)
             transition = of_cells(modes[numbers[0]], cell).reset_map(runs.state[:, cell], left)
-            new, time = after_reset(runs, transition, horizon), runs.end_time + transition.crossing_time
-            crosses = lost & (jnp.isfinite(time) | kept.at_end)
-            time = jnp.where(jnp.isfinite(time), time, runs.end_time)
+            new = after_reset(runs, transition, horizon)
+            crosses = lost & (jnp.isfinite(transition.crossing_time) | kept.at_end) & (new.status != FAILED)
             is_new = crosses & ~kept.at_end
             counted = kept.counted + is_new
             place = jnp.where(crosses if after else is_new, place_of(counted, skip, count), count)
-            state, mode = (new.state, new.mode) if after else (runs.state, runs.mode)
-            all_cells = jnp.arange(size)
+            shown, all_cells = new if after else runs, jnp.arange(size)
+            resets = jnp.where(is_new, 0, kept.resets + lost)
             kept = Kept(
                 counted,
                 kept.at_end & ~lost,
-                kept.time.at[place, all_cells].set(time, mode="drop"),
-                kept.state.at[:, place, all_cells].set(state, mode="drop"),
-                kept.mode.at[place, all_cells].set(mode, mode="drop"),
+                kept.beyond,
+                resets,
+                kept.time.at[place, all_cells].set(shown.end_time, mode="drop"),
+                kept.state.at[:, place, all_cells].set(shown.state, mode="drop"),
+                kept.mode.at[place, all_cells].set(shown.mode, mode="drop"),
             )
             is_last = (counted >= skip + count) & (new.status == RUNNING)
-            new = new._replace(status=jnp.where(is_last, CROSSED, new.status))
+            is_endless = (resets >= MOST_ROUNDS) & (new.status == RUNNING)
+            status = jnp.where(is_last, CROSSED, jnp.where(is_endless, UNRESOLVED, new.status))
+            new = new._replace(status=status)
             return chosen(lost, new, runs), kept
 
         groups, runs = [(number,) for number in range(len(modes))], at_start(first, states, cells, len(model.counters))
         # As many resets between two crossings as in a run.
-        most = MOST_ROUNDS * (count + skip)
-        ended, kept = all_rounds((runs, start(len(states))), groups, solve, reset, most)
+        ended, kept = all_rounds((runs, start(len(states))), groups, solve, reset, MOST_ROUNDS * (count + skip))
         counted = ended.counts
         rows = jnp.full_like(over_cells(lambda mode, state: mode.shown(state), modes[0])(kept.state), jnp.nan)
         for number, mode in enumerate(modes):
@@ -246,7 +268,7 @@ class Rise(eqx.Module):
         return -self.event(t, y)
 
 
-def section_of(event: Any, direction: str, side: str) -> Any:
+def section_of(event: Any, direction: str, side: str) -> Callable[..., Any] | None:
     """The event of a section, checked."""
     if direction not in ("fall", "rise"):
         raise ValueError(f"direction = {shown(direction)} must be 'fall' or 'rise'")

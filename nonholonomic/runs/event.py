@@ -204,6 +204,21 @@ def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index
     return over_lanes(of_run, tuple(leaves), (time, *parts))
 
 
+#: A function counts as zero if changing every component of the state by this fraction of its size could make it zero:
+#: round-off.
+ROUND_OFF = 1e-14
+
+
+def near_zero(event: Any, state: States, rates: States, scales: States) -> tuple[Lanes, Lanes, Lanes]:
+    """The value of an event function, its slope along the motion, and the round-off of the value. **Arguments:** `event`:
+    the function of the state; `rates`, `scales`: the rates and the magnitudes of the components."""
+    value, slope = jax.jvp(event, (state,), (rates,))
+    sizes = jnp.abs(state) + jnp.where(scales < UNMEASURED, scales, 0.0)
+    directions = jnp.eye(len(state)).reshape(*2 * state.shape[:1], *[1] * (state.ndim - 1)) * sizes
+    changes = jax.vmap(lambda direction: jax.jvp(event, (state,), (direction,))[1])(directions)
+    return value, slope, ROUND_OFF * jnp.sum(jnp.abs(changes), axis=0)
+
+
 class EventMode(AbstractBatchedMode):
     """A mode with a user's event. The event also happens at a reset that lets its function jump through zero.
 
@@ -224,12 +239,16 @@ class EventMode(AbstractBatchedMode):
         core, clock = self._parts(state)
         transition = self.modes[self.index].reset_map(core, left)
         new_state = jnp.concatenate([transition.state, clock + transition.elapsed])
-        before = value_in_lanes(self.model, self.modes[self.index], self.index, state)
+        problem = self.problem(state)
+        rates, scales = problem.field(jnp.zeros_like(state[0]), state), problem.start()[1]
+        before, slope, error = near_zero(problem.event_function, state, rates, scales)
         after = before
         for number, mode in enumerate(self.modes):
             value = value_in_lanes(self.model, mode, number, new_state)
             after = jnp.where(transition.mode == number, value, after)
-        jumps = (before > 0.0) & (after <= 0.0) & (transition.status == RUNNING)
+        # Where the function is zero up to round-off, the direction of the motion decides.
+        falls = jnp.where(jnp.abs(before) <= error, slope < 0.0, before > 0.0)
+        jumps = falls & (after <= 0.0) & (transition.status == RUNNING)
         # A run that ends between two modes is in neither.
         return transition._replace(
             mode=jnp.where(jumps & (not self.continues), len(self.modes), transition.mode),

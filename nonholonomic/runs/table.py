@@ -54,7 +54,7 @@ class TableJob(NamedTuple):
     """The computation for every cell, as data that can be sent to another process.
 
     - `model`: with scalars; `form`: the names in the table.
-    - `t1`: horizon [s]; `crossing`: "first", "last" or "both"; `settings`: those of the integration.
+    - `t1`: horizon [s]; `crossing`: "first", "last", "both" or "after"; `settings`: those of the integration.
     - `slopes`: full name of a parameter -> name of the variable with the derivative of the time.
     - `errors`: whether to run every cell again at other tolerances.
     - `samples`: the quantities at given times, or `None`; `timed`: whether runs are timed, not only sampled.

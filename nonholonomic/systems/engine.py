@@ -23,12 +23,8 @@ from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Components, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
-from ..runs.event import UNMEASURED
+from ..runs.event import ROUND_OFF, UNMEASURED, near_zero
 from .form import Form, State
-
-#: A function counts as zero if changing every component of the state by this fraction of its size could make it zero:
-#: round-off.
-ROUND_OFF = 1e-14
 
 #: A state at the start of a mode may be wrong by this many times the tolerance, because the mode before ended with an
 #: error. Slower changes of a margin than such errors allow say nothing of its direction.
@@ -238,11 +234,20 @@ class BatchedMode(AbstractBatchedMode):
 
 def _after_reset(mode: BatchedMode, state: Float[Array, " components"], exit: Int[Array, ""]) -> Transition:
     """The transition of one run at the end of its mode, whose margin of index `exit` fell."""
-    numbers, scales = mode.numbers, mode.scales
-    form, zero, now, never = mode.form, jnp.zeros((), int), jnp.zeros(()), jnp.asarray(jnp.inf)
-    if not form.traits.resets[mode.index]:
-        return Transition(zero + mode.index, state, now, zero + LEFT_DOMAIN, never, zero[None])
+    numbers, form, zero, now, never = mode.numbers, mode.form, jnp.zeros((), int), jnp.zeros(()), jnp.asarray(jnp.inf)
     t, y = time_and_state(form, tuple(state))
+
+    def value(state: Float[Array, " components"]) -> Float[Array, ""]:
+        return form.function("event")(numbers, *time_and_state(form, tuple(state)))
+
+    before, error, ends = now, now, jnp.asarray(False)
+    if form.has_event:
+        rate = jnp.concatenate([form.function("field", mode.index)(numbers, t, y), jnp.ones(len(state) - form.size)])
+        before, slope, error = near_zero(value, state, rate, mode.scales)
+        ends = (jnp.abs(before) <= error) & (slope < 0.0)
+    if not form.traits.resets[mode.index]:
+        status = jnp.where(ends & (not mode.continues), CROSSED, LEFT_DOMAIN)
+        return Transition(zero + mode.index, state, now, status, jnp.where(ends, now, never), zero[None])
     state_after, number = form.function("reset", mode.index)(numbers, t, y, exit)
     number = jnp.asarray(number).astype(int)
     for k, is_projected in enumerate(form.traits.projected):
@@ -253,15 +258,7 @@ def _after_reset(mode: BatchedMode, state: Float[Array, " components"], exit: In
     status = jnp.where((number >= 0) & (number < form.modes), RUNNING, FAILED)
     if not form.has_event:
         return Transition(number, state_after, now, status, never, zero[None] + 1)
-
-    def value(state: Float[Array, " components"]) -> Float[Array, ""]:
-        return form.function("event")(numbers, *time_and_state(form, tuple(state)))
-
-    rate = jnp.concatenate([form.function("field", mode.index)(numbers, t, y), jnp.ones(len(state) - form.size)])
-    sizes = jnp.abs(state) + jnp.where(scales < UNMEASURED, scales, 0.0)
-    is_zero = jnp.abs(value(state)) <= ROUND_OFF * jnp.sum(jnp.abs(jax.jacfwd(value)(state)) * sizes)
-    ends = is_zero & (jax.jvp(value, (state,), (rate,))[1] < 0.0)
-    jumps = ~ends & (value(state) > 0.0) & (value(state_after) <= 0.0)
+    jumps = (before > error) & (value(state_after) <= 0.0) & (status == RUNNING)
     crossed = ends | jumps
     if mode.continues:
         return Transition(number, state_after, now, status, jnp.where(crossed, now, never), zero[None] + 1)
