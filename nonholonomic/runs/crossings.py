@@ -114,9 +114,10 @@ def on_margin(problem: AbstractProblem, time: Lanes, state: States) -> Bool[Arra
     return (slope < 0.0) & (value <= -slope * SAME * time)
 
 
-def on_section(problem: AbstractProblem, time: Lanes, state: States) -> tuple[Lanes, Lanes, Lanes]:
-    """The event function of runs that have spent some time [s] in a mode, as `near_zero` gives it."""
-    return near_zero(problem.event_function, state, problem.field(time, state), problem.start()[1])
+def crossed_at_end(outcome: Outcome) -> Bool[Array, " cells"]:
+    """Whether the last crossing of each run in a mode is where it ended, up to `SAME`."""
+    is_last = outcome.end_time - outcome.crossing_time <= SAME * outcome.end_time
+    return is_last & jnp.isfinite(outcome.crossing_time)
 
 
 @compiled_alone
@@ -146,10 +147,23 @@ def crossings_in_cells(
         zeros, false = jnp.zeros(size, int), jnp.zeros(size, bool)
         return Kept(zeros, false, false, zeros, never, state, none)
 
+    def with_row(kept: Kept, is_new: Array, is_shown: Array, time: Array, state: Array, mode: Any) -> Kept:
+        counted, cell = kept.counted + is_new, jnp.arange(size)
+        place = jnp.where(is_shown, place_of(counted, skip, count), count)
+        return kept._replace(
+            counted=counted,
+            time=kept.time.at[place, cell].set(time, mode="drop"),
+            state=kept.state.at[:, place, cell].set(state, mode="drop"),
+            mode=kept.mode.at[place, cell].set(mode, mode="drop"),
+        )
+
     if model.smooth:
         problem = problem_of(model, size, names)
         begin = jnp.zeros(size)
         outcome, kept = followed(problem, t1, start(len(problem.start()[0])), begin, begin, 0, cells)
+        value, slope, error = near_zero(problem, outcome.end_time, outcome.state)
+        is_new = (outcome.status == LEFT_DOMAIN) & (jnp.abs(value) <= error) & (slope < 0.0) & ~crossed_at_end(outcome)
+        kept = with_row(kept, is_new, is_new, outcome.end_time, outcome.state, 0)
         rows, ended, counted = kept.state, outcome, ()
     else:
         modes, first, states = modes_of(model, size, settings.tolerance, names, True)
@@ -159,7 +173,7 @@ def crossings_in_cells(
             (runs, kept), cell = carry, selected_cells(active)
             left = jnp.where(active, greatest(horizon - runs.end_time, 0.0), 0.0)
             problem = of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
-            value, slope, error = on_section(problem, jnp.zeros(size), problem.start()[0])
+            value, slope, error = near_zero(problem, jnp.zeros(size), problem.start()[0])
             is_on = kept.beyond & (jnp.abs(value) <= error) & (slope < 0.0)
             leaves = jnp.where(is_on, -2.0 * value / jnp.where(is_on, slope, 1.0), -jnp.inf)
             outcome, new = followed(problem, left, kept, runs.end_time, leaves, numbers[0], jnp.asarray(size))
@@ -169,11 +183,8 @@ def crossings_in_cells(
                 moved = outcome.state + shift * problem.field(outcome.end_time, outcome.state)
                 status = jnp.where(is_reset, LEFT_DOMAIN, outcome.status)
                 outcome = outcome._replace(status=status, end_time=outcome.end_time + shift, state=moved)
-            value, _, error = on_section(problem, outcome.end_time, outcome.state)
-            at_end = (outcome.end_time - outcome.crossing_time <= SAME * outcome.end_time) & jnp.isfinite(
-                outcome.crossing_time
-            )
-            at_end &= (outcome.crossing_time > leaves) & (outcome.status == LEFT_DOMAIN)
+            value, _, error = near_zero(problem, outcome.end_time, outcome.state)
+            at_end = crossed_at_end(outcome) & (outcome.crossing_time > leaves) & (outcome.status == LEFT_DOMAIN)
             resets = jnp.where(new.counted > kept.counted, 0, kept.resets)
             new = new._replace(at_end=at_end, beyond=value <= error, resets=resets)
             advanced = (after_solve(runs, outcome, horizon), new)
@@ -186,23 +197,13 @@ def crossings_in_cells(
             new = after_reset(runs, transition, horizon)
             crosses = lost & (jnp.isfinite(transition.crossing_time) | kept.at_end) & (new.status != FAILED)
             is_new = crosses & ~kept.at_end
-            counted = kept.counted + is_new
-            place = jnp.where(crosses if after else is_new, place_of(counted, skip, count), count)
-            shown, all_cells = new if after else runs, jnp.arange(size)
+            shown = new if after else runs
+            kept = with_row(kept, is_new, crosses if after else is_new, shown.end_time, shown.state, shown.mode)
             resets = jnp.where(is_new, 0, kept.resets + lost)
-            kept = Kept(
-                counted,
-                kept.at_end & ~lost,
-                kept.beyond,
-                resets,
-                kept.time.at[place, all_cells].set(shown.end_time, mode="drop"),
-                kept.state.at[:, place, all_cells].set(shown.state, mode="drop"),
-                kept.mode.at[place, all_cells].set(shown.mode, mode="drop"),
-            )
-            is_last = (counted >= skip + count) & (new.status == RUNNING)
-            is_endless = (resets >= MOST_ROUNDS) & (new.status == RUNNING)
-            status = jnp.where(is_last, CROSSED, jnp.where(is_endless, UNRESOLVED, new.status))
-            new = new._replace(status=status)
+            kept = kept._replace(at_end=kept.at_end & ~lost, resets=resets)
+            is_last = kept.counted >= skip + count
+            status = jnp.where(is_last, CROSSED, jnp.where(resets >= MOST_ROUNDS, UNRESOLVED, new.status))
+            new = new._replace(status=jnp.where(new.status == RUNNING, status, new.status))
             return chosen(lost, new, runs), kept
 
         groups, runs = [(number,) for number in range(len(modes))], at_start(first, states, cells, len(model.counters))

@@ -209,10 +209,10 @@ def value_in_lanes(model: AbstractModel, mode: AbstractBatchedMode | None, index
 ROUND_OFF = 1e-14
 
 
-def near_zero(event: Any, state: States, rates: States, scales: States) -> tuple[Lanes, Lanes, Lanes]:
-    """The value of an event function, its slope along the motion, and the round-off of the value. **Arguments:** `event`:
-    the function of the state; `rates`, `scales`: the rates and the magnitudes of the components."""
-    value, slope = jax.jvp(event, (state,), (rates,))
+def near_zero(problem: AbstractProblem, time: Lanes, state: States) -> tuple[Lanes, Lanes, Lanes]:
+    """The event function of runs that have spent some time [s] in a mode, its slope along the motion, and its round-off."""
+    event, scales = problem.event_function, problem.start()[1]
+    value, slope = jax.jvp(event, (state,), (problem.field(time, state),))
     sizes = jnp.abs(state) + jnp.where(scales < UNMEASURED, scales, 0.0)
     directions = jnp.eye(len(state)).reshape(*2 * state.shape[:1], *[1] * (state.ndim - 1)) * sizes
     changes = jax.vmap(lambda direction: jax.jvp(event, (state,), (direction,))[1])(directions)
@@ -239,9 +239,7 @@ class EventMode(AbstractBatchedMode):
         core, clock = self._parts(state)
         transition = self.modes[self.index].reset_map(core, left)
         new_state = jnp.concatenate([transition.state, clock + transition.elapsed])
-        problem = self.problem(state)
-        rates, scales = problem.field(jnp.zeros_like(state[0]), state), problem.start()[1]
-        before, slope, error = near_zero(problem.event_function, state, rates, scales)
+        before, slope, error = near_zero(self.problem(state), jnp.zeros_like(state[0]), state)
         after = before
         for number, mode in enumerate(self.modes):
             value = value_in_lanes(self.model, mode, number, new_state)

@@ -210,9 +210,11 @@ class BatchedMode(AbstractBatchedMode):
         An event at the end of the mode comes before the reset. If the reset jumps over the zero of the event function,
         the event happens at the reset, and the run ends between two modes.
         """
-        axes = (lambda leaf: -1 if eqx.is_array(leaf) and leaf.ndim else None, -1, -1)
+        zeros = jnp.zeros(state.shape[1:])
+        event = near_zero(ModeProblem(self, state), zeros, state) if self.form.has_event else (zeros,) * 3
+        axes = (lambda leaf: -1 if eqx.is_array(leaf) and leaf.ndim else None, -1, -1, -1)
         reset = eqx.filter_vmap(_after_reset, in_axes=axes, out_axes=-1)
-        return reset(self, state, self._exit(stop_gradient(state)))
+        return reset(self, state, self._exit(stop_gradient(state)), event)
 
     def fallen(self, state: Float[Array, " components"]) -> str:
         """The name of the margin that ended the mode, or its index."""
@@ -232,22 +234,18 @@ class BatchedMode(AbstractBatchedMode):
         return jnp.where(jnp.any(falls, axis=0), jnp.argmax(falls, axis=0), steepest)
 
 
-def _after_reset(mode: BatchedMode, state: Float[Array, " components"], exit: Int[Array, ""]) -> Transition:
-    """The transition of one run at the end of its mode, whose margin of index `exit` fell."""
+def _after_reset(
+    mode: BatchedMode, state: Float[Array, " components"], exit: Int[Array, ""], event: tuple[Array, Array, Array]
+) -> Transition:
+    """The transition of one run at the end of its mode, whose margin of index `exit` fell. **Arguments:** `event`: as from
+    `near_zero`."""
     numbers, form, zero, now, never = mode.numbers, mode.form, jnp.zeros((), int), jnp.zeros(()), jnp.asarray(jnp.inf)
-    t, y = time_and_state(form, tuple(state))
-
-    def value(state: Float[Array, " components"]) -> Float[Array, ""]:
-        return form.function("event")(numbers, *time_and_state(form, tuple(state)))
-
-    before, error, ends = now, now, jnp.asarray(False)
-    if form.has_event:
-        rate = jnp.concatenate([form.function("field", mode.index)(numbers, t, y), jnp.ones(len(state) - form.size)])
-        before, slope, error = near_zero(value, state, rate, mode.scales)
-        ends = (jnp.abs(before) <= error) & (slope < 0.0)
+    before, slope, error = event
+    ends = (jnp.abs(before) <= error) & (slope < 0.0)
     if not form.traits.resets[mode.index]:
         status = jnp.where(ends & (not mode.continues), CROSSED, LEFT_DOMAIN)
         return Transition(zero + mode.index, state, now, status, jnp.where(ends, now, never), zero[None])
+    t, y = time_and_state(form, tuple(state))
     state_after, number = form.function("reset", mode.index)(numbers, t, y, exit)
     number = jnp.asarray(number).astype(int)
     for k, is_projected in enumerate(form.traits.projected):
@@ -258,7 +256,8 @@ def _after_reset(mode: BatchedMode, state: Float[Array, " components"], exit: In
     status = jnp.where((number >= 0) & (number < form.modes), RUNNING, FAILED)
     if not form.has_event:
         return Transition(number, state_after, now, status, never, zero[None] + 1)
-    jumps = (before > error) & (value(state_after) <= 0.0) & (status == RUNNING)
+    after = form.function("event")(numbers, *time_and_state(form, tuple(state_after)))
+    jumps = (before > error) & (after <= 0.0) & (status == RUNNING)
     crossed = ends | jumps
     if mode.continues:
         return Transition(number, state_after, now, status, jnp.where(crossed, now, never), zero[None] + 1)
