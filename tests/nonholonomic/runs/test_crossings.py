@@ -9,6 +9,7 @@ import nonholonomic
 import stroller
 import tippe
 from nonholonomic import AbstractMode, Hybrid, crossings, event_time, sweep
+from nonholonomic.hybrid import MOST_ROUNDS
 
 
 class Spring(AbstractMode):
@@ -43,15 +44,15 @@ def test_returns_of_a_damped_spring():
     assert table.dims("y1") == ("damping", "crossing")
     assert set(table.status.ravel()) == {"event"}
     np.testing.assert_allclose(table.end_time, table.time[:, -1], atol=1e-9)
-    # No more steps than those of runs through the event to the same horizon.
-    last = sweep(spring, [1.0, 0.0], 40.0, event=middle, crossing="last", **options)
-    assert (table.steps <= last.steps).all()
     # With a clock in the state, and for rises.
     rises = crossings(spring, [1.0, 0.0], 12.0, middle_or_later, count=3, direction="rise", **options)
     np.testing.assert_allclose(rises.time[:, :2], times[:, :2] - (np.pi / rate)[:, None], atol=1e-9)
     assert np.isnan(rises.time[:, 2]).all()
     assert np.isnan(rises.y1[:, 2]).all()
     assert set(rises.status.ravel()) == {"completed"}
+    # The steps of runs through the event to the same horizon.
+    last = sweep(spring, [1.0, 0.0], 12.0, event=lambda t, y: -middle_or_later(t, y), crossing="last", **options)
+    np.testing.assert_array_equal(rises.steps, last.steps)
 
 
 def ground(t, y):
@@ -69,6 +70,56 @@ def test_crossings_at_resets(side):
     speed = np.sqrt(2.0 * GRAVITY) * 0.8 ** np.arange(1, 5)
     np.testing.assert_allclose(table.y1, -speed if side == "before" else 0.8 * speed, rtol=1e-11)
     np.testing.assert_array_equal(table.y2, np.arange(1, 5) + (side == "after"))
+
+
+class Bouncing(Ball):
+    """The height keeps its round-off at a bounce. From the bounce of some number on, the next mode is another one."""
+
+    bounces: float = np.inf
+    then: int = 0
+
+    def reset(self, t, y):
+        return jnp.array([y[0], -self.restitution * y[1], y[2] + 1.0]), jnp.where(y[2] + 1.5 > self.bounces, self.then, 0)
+
+
+class Falling(AbstractMode):
+    """The ball stops on the ground."""
+
+    def field(self, t, y):
+        return jnp.array([y[1], -GRAVITY, 0.0])
+
+    def margin(self, t, y):
+        return y[0]
+
+
+@pytest.mark.parametrize("ball", [Ball, Bouncing])
+def test_a_height_that_touches_zero_at_a_reset_does_not_rise(ball):
+    """Towards the end of the endless bounces, the height on the ground is round-off of either sign."""
+    axes = {"restitution": np.array([0.5, 0.6])}
+    options = {"count": 2, "direction": "rise", "axes": axes, "progress": False}
+    table = crossings(Hybrid([ball()]), [1.0, 0.0, 0.0], 2.5, ground, **options)
+    assert np.isnan(table.time).all()
+    # Without crossings, the bounces end as without a section.
+    assert table.status.tolist() == ["unresolved", "unresolved"]
+    assert table.switches.tolist() == [MOST_ROUNDS, MOST_ROUNDS]
+
+
+@pytest.mark.parametrize("first", [(), (Bouncing(bounces=1, then=1),)])
+def test_a_section_at_the_end_of_a_mode_without_a_reset(first):
+    table = crossings(Hybrid([*first, Falling()]), [1.0, 0.0, 0.0], 9.0, ground, count=3, progress=False)
+    times = [bounce(1.0, 0.8, GRAVITY, k) if k <= len(first) + 1 else np.nan for k in range(1, 4)]
+    np.testing.assert_allclose(table.time, times, atol=1e-12)
+    assert table.status == "stopped"
+
+
+def test_no_crossing_at_a_reset_into_a_mode_that_does_not_exist():
+    """The reset also lets the number of bounces jump over the section."""
+    ball = Hybrid([Bouncing(bounces=2, then=-1)], lambda t, y: 1.5 - y[2])
+    table = crossings(ball, [1.0, 0.0, 0.0], 9.0, count=1, progress=False)
+    assert np.isnan(table.time[0])
+    assert table.status == "failed"
+    with pytest.warns(UserWarning, match="the run ended as 'failed'"):
+        assert np.isnan(event_time(ball, [1.0, 0.0, 0.0], 9.0))
 
 
 def test_crossings_between_resets_in_a_table():
