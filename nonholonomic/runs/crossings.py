@@ -116,8 +116,7 @@ def on_margin(problem: AbstractProblem, time: Lanes, state: States) -> Bool[Arra
 
 def crossed_at_end(outcome: Outcome) -> Bool[Array, " cells"]:
     """Whether the last crossing of each run in a mode is where it ended, up to `SAME`."""
-    is_last = outcome.end_time - outcome.crossing_time <= SAME * outcome.end_time
-    return is_last & jnp.isfinite(outcome.crossing_time)
+    return jnp.isfinite(outcome.crossing_time) & (outcome.end_time - outcome.crossing_time <= SAME * outcome.end_time)
 
 
 @compiled_alone
@@ -133,13 +132,6 @@ def crossings_in_cells(
     after: bool,
 ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
     """The `Status` of all cells, of which only the first `cells` are run, and the variables of the table."""
-
-    def followed(
-        problem: AbstractProblem, t1: Array, kept: Kept, begin: Array, leaves: Array, number: int, cells: Array
-    ) -> tuple[Outcome, Kept]:
-        scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=True)
-        outcome, _, kept = scheduler.solve(CrossingRecorder(skip, count, begin, leaves, number), kept)
-        return outcome, kept
 
     def start(components: int) -> Kept:
         never, none = jnp.full((count, size), jnp.nan), jnp.zeros((count, size), int)
@@ -158,9 +150,11 @@ def crossings_in_cells(
         )
 
     if model.smooth:
-        problem = problem_of(model, size, names)
-        begin = jnp.zeros(size)
-        outcome, kept = followed(problem, t1, start(len(problem.start()[0])), begin, begin, 0, cells)
+        problem, begin = problem_of(model, size, names), jnp.zeros(size)
+        scheduler = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=True)
+        outcome, _, kept = scheduler.solve(
+            CrossingRecorder(skip, count, begin, begin, 0), start(len(problem.start()[0]))
+        )
         value, slope, error = near_zero(problem, outcome.end_time, outcome.state)
         is_new = (outcome.status == LEFT_DOMAIN) & (jnp.abs(value) <= error) & (slope < 0.0) & ~crossed_at_end(outcome)
         kept = with_row(kept, is_new, is_new, outcome.end_time, outcome.state, 0)
@@ -175,8 +169,9 @@ def crossings_in_cells(
             problem = of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
             value, slope, error = near_zero(problem, jnp.zeros(size), problem.start()[0])
             is_on = kept.beyond & (jnp.abs(value) <= error) & (slope < 0.0)
-            leaves = jnp.where(is_on, -2.0 * value / jnp.where(is_on, slope, 1.0), -jnp.inf)
-            outcome, new = followed(problem, left, kept, runs.end_time, leaves, numbers[0], jnp.asarray(size))
+            leaves = jnp.where(is_on, -2.0 * error / jnp.where(is_on, slope, 1.0), -jnp.inf)
+            scheduler = LaneScheduler.of(problem, left, jnp.asarray(size), settings, nonterminal=True, one_kernel=True)
+            outcome, _, new = scheduler.solve(CrossingRecorder(skip, count, runs.end_time, leaves, numbers[0]), kept)
             if after:
                 is_reset = (outcome.status == CROSSED) & on_margin(problem, outcome.end_time, outcome.state)
                 shift = jnp.where(is_reset, outcome.crossing_time - outcome.end_time, 0.0)
@@ -199,10 +194,9 @@ def crossings_in_cells(
             is_new = crosses & ~kept.at_end
             shown = new if after else runs
             kept = with_row(kept, is_new, crosses if after else is_new, shown.end_time, shown.state, shown.mode)
-            resets = jnp.where(is_new, 0, kept.resets + lost)
-            kept = kept._replace(at_end=kept.at_end & ~lost, resets=resets)
+            kept = kept._replace(at_end=kept.at_end & ~lost, resets=jnp.where(is_new, 0, kept.resets + lost))
             is_last = kept.counted >= skip + count
-            status = jnp.where(is_last, CROSSED, jnp.where(resets >= MOST_ROUNDS, UNRESOLVED, new.status))
+            status = jnp.where(is_last, CROSSED, jnp.where(kept.resets >= MOST_ROUNDS, UNRESOLVED, new.status))
             new = new._replace(status=jnp.where(new.status == RUNNING, status, new.status))
             return chosen(lost, new, runs), kept
 
@@ -210,10 +204,8 @@ def crossings_in_cells(
         # As many resets between two crossings as in a run.
         ended, kept = all_rounds((runs, start(len(states))), groups, solve, reset, MOST_ROUNDS * (count + skip))
         counted = ended.counts
-        rows = jnp.full_like(over_cells(lambda mode, state: mode.shown(state), modes[0])(kept.state), jnp.nan)
-        for number, mode in enumerate(modes):
-            of_this = over_cells(lambda mode, state: mode.shown(state), mode)(kept.state)
-            rows = jnp.where(kept.mode == number, of_this, rows)
+        rows = [over_cells(lambda mode, state: mode.shown(state), mode)(kept.state) for mode in modes]
+        rows = jnp.select([kept.mode == number for number in range(len(modes))], rows, jnp.nan)
     status = jnp.where(kept.counted >= skip + count, int(Status.EVENT), model.ended(ended, settings.tolerance))
 
     def read(model: AbstractModel, time: Array, rows: Array, mode: Array) -> dict[str, Array]:

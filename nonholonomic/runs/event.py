@@ -240,10 +240,8 @@ class EventMode(AbstractBatchedMode):
         transition = self.modes[self.index].reset_map(core, left)
         new_state = jnp.concatenate([transition.state, clock + transition.elapsed])
         before, slope, error = near_zero(self.problem(state), jnp.zeros_like(state[0]), state)
-        after = before
-        for number, mode in enumerate(self.modes):
-            value = value_in_lanes(self.model, mode, number, new_state)
-            after = jnp.where(transition.mode == number, value, after)
+        values = [value_in_lanes(self.model, mode, number, new_state) for number, mode in enumerate(self.modes)]
+        after = jnp.select([transition.mode == number for number in range(len(values))], values, before)
         # Where the function is zero up to round-off, the direction of the motion decides.
         falls = jnp.where(jnp.abs(before) <= error, slope < 0.0, before > 0.0)
         jumps = falls & (after <= 0.0) & (transition.status == RUNNING)

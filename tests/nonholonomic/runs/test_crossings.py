@@ -79,7 +79,8 @@ class Bouncing(Ball):
     then: int = 0
 
     def reset(self, t, y):
-        return jnp.array([y[0], -self.restitution * y[1], y[2] + 1.0]), jnp.where(y[2] + 1.5 > self.bounces, self.then, 0)
+        mode = jnp.where(y[2] + 1.5 > self.bounces, self.then, 0)
+        return jnp.array([y[0], -self.restitution * y[1], y[2] + 1.0]), mode
 
 
 class Falling(AbstractMode):
