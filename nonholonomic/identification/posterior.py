@@ -598,7 +598,8 @@ def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]
     lists = jax.tree.map(listed, (measurements, prediction))
     # The program of limits takes three times as long to compile.
     has_limits = bool(np.any(np.asarray(measurements.censored)))
-    parts = [_residuals(*jax.tree.map(lambda values, k=k: values[k], lists), has_limits) for k in range(len(lists[1]))]
+    rows = [jax.tree.map(lambda values, k=k: values[k], lists) for k in range(len(lists[1]))]
+    parts = [_residuals(measured, predicted, has_limits) for measured, predicted in rows]
     results = [np.concatenate(values)[: prediction.size] for values in zip(*parts, strict=True)]
     return [values.reshape(prediction.shape) for values in results]
 

@@ -303,7 +303,8 @@ class Search:
         """A lower bound [m] of the distance of points from all obstacles: seen from above, exact outside of them, and in space,
         0 inside."""
         if self.problem.map is not None:
-            return self.obstacles.gaps(np.repeat(points[..., None, :], 4, axis=-2)).min(axis=-1, initial=np.inf)
+            gaps = np.asarray(self.obstacles.gaps(np.repeat(points[..., None, :], 4, axis=-2)))
+            return gaps.min(axis=-1, initial=np.inf)
         boxes = self.obstacles.boxes
         side = boxes[:, 0] - boxes[:, 3]
         length, width = np.linalg.norm(side, axis=-1), np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=-1)
