@@ -600,8 +600,7 @@ def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]
     has_limits = bool(np.any(np.asarray(measurements.censored)))
     rows = [jax.tree.map(lambda values, k=k: values[k], lists) for k in range(len(lists[1]))]
     parts = [_residuals(measured, predicted, has_limits) for measured, predicted in rows]
-    results = [np.concatenate(values)[: prediction.size] for values in zip(*parts, strict=True)]
-    return [values.reshape(prediction.shape) for values in results]
+    return [np.concatenate(values)[: prediction.size].reshape(prediction.shape) for values in zip(*parts, strict=True)]
 
 
 @eqx.filter_jit
