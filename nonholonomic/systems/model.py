@@ -121,7 +121,7 @@ class OwnModel(AbstractModel):
     def legal(self) -> Bool[Array, "..."]:
         return _all_left(mechanics.rooms(_parts_of_cells(self), jnp))
 
-    def legal_cells(self, columns: dict[str, Array]) -> Bool[Array, " cells"]:
+    def legal_cells(self, columns: dict[str, Array | np.ndarray]) -> Bool[Array, " cells"]:
         return _all_left(mechanics.rooms(jax.tree.map(np.asarray, _compiled_parts(self.replaced(columns))), np))
 
     @property
