@@ -15,19 +15,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
 
 from ..compilation.tracing import named_errors, with_own_numbers
 from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, tangent_scale, tangents_by
 from ..hybrid import solve_hybrid
 from ..hybrid.saltation import VariationalMode, along, delay, variational_modes, variational_start
 from ..integration import Settings
-from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESOLVED, legal_run
+from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESOLVED
 from ..terminal import status_line
 from ..text import described, shown
 from ..validation import as_number, is_traced, require_outside
 from .crossings import SAME, on_margin, section_of
-from .event import Ensemble
+from .event import Ensemble, EventTime
 from .model import AbstractModel, AbstractSceneModel, check_run, model_of, require_event, settings_for_lanes
 
 #: The most Newton steps; the residual at which they have converged, in units of the tolerance; the tolerance of the last step.
@@ -185,10 +185,9 @@ class Newton(NamedTuple):
 
 
 class OrbitSolve(AbstractDifferentiableSolve):
-    """Periodic orbits of cells. The leaves are the horizon or the period, the numbers of the model, floats first, and the
-    tolerance.
+    """Periodic orbits of cells. The leaves are those of an `EventTime`, but the horizon, which may be the period, comes first.
 
-    - `movable`, `structures`, `rest`, `settings`, `unchecked`: as for `EventTime`, the horizon among the movable leaves.
+    - `movable`: number of movable leaves; `event`: the times of the section.
     - `starts`: the leaves that are components of the start.
     - `is_driven`: whether the period is given; `free`: the components that may change; `has_symmetry`: whether the
       parameters of the model contain a symmetry.
@@ -196,10 +195,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
     """
 
     movable: int
-    structures: tuple[Any, Any] = eqx.field(static=True)
-    rest: PyTree
-    settings: Settings
-    unchecked: bool = eqx.field(static=True)
+    event: EventTime
     starts: tuple[int, ...] = eqx.field(static=True)
     is_driven: bool = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
@@ -209,16 +205,11 @@ class OrbitSolve(AbstractDifferentiableSolve):
     @classmethod
     def of(cls, model: Any, t1: Array, settings: Settings, *options: Any) -> tuple[Any, ...]:
         """The solve and its leaves. **Arguments:** `options`: the fields from `is_driven` on."""
-        unchecked = is_traced((model, t1, settings.tolerance))
-        floats, rest = eqx.partition(model, eqx.is_inexact_array)
-        others, rest = eqx.partition(rest, eqx.is_array)
-        numbers, further = (jax.tree.flatten(part) for part in (floats, others))
-        structures = (numbers[1], further[1])
+        event, *numbers, t1, tolerance = EventTime.of(model, t1, settings, False)
         pairs = zip(model.parameters.names, model.parameters.values, strict=True)
         names = [name for name, value in pairs if eqx.is_inexact_array(value)]
         starts = tuple(k for k, name in enumerate(names, 1) if name.startswith("start"))
-        solve = cls(1 + len(numbers[0]), structures, rest, settings.with_tolerance(None), unchecked, starts, *options)
-        return (solve, t1, *numbers[0], *further[0], settings.tolerance)
+        return (cls(1 + event.movable, event, starts, *options), t1, *numbers, tolerance)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.zeros(jnp.shape(value), bool)
@@ -230,8 +221,12 @@ class OrbitSolve(AbstractDifferentiableSolve):
 
     def model(self, leaves: Sequence[Array]) -> AbstractModel:
         """The model of the leaves."""
-        parts = zip(self.structures, (leaves[1 : self.movable], leaves[self.movable : -1]), strict=True)
-        return eqx.combine(*(jax.tree.unflatten(structure, part) for structure, part in parts), self.rest)
+        return self.event.model(self.of_event(leaves))
+
+    def of_event(self, leaves: Sequence[Array]) -> tuple[Array, ...]:
+        """The leaves in the order of the `EventTime`."""
+        t1, *numbers, tolerance = leaves
+        return (*numbers, t1, tolerance)
 
     def with_start(self, leaves: Sequence[Array], state: Float[Array, "components cells"]) -> tuple[Array, ...]:
         """The leaves with other starts."""
@@ -278,7 +273,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
         **Arguments:** `others`: the leaves of the model, apart from the start, along which to differentiate; `left`: horizon
         [s], 0 for cells that are not run.
         """
-        active, settings = (*self.starts, *others), self.settings.with_tolerance(tolerance)
+        active, settings = (*self.starts, *others), self.event.settings.with_tolerance(tolerance)
 
         def build(leaves: tuple[Array, ...], cells: int | None) -> Ensemble:
             assert cells is not None
@@ -305,8 +300,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
             at_edge |= at_reset | (is_here & (primal[-1] <= SAME * ended.end_time))
             if own_mode.margins and not self.is_driven:
                 through, *by = (dataclasses.replace(part, continues=True) for part in (own_mode, *of_mode.tangents))
-                onward = dataclasses.replace(of_mode, mode=through, tangents=tuple(by))
-                transition = onward.reset_map(ended.state.at[:size].set(moved), jnp.full(cells, jnp.inf))
+                continued = dataclasses.replace(of_mode, mode=through, tangents=tuple(by))
+                transition = continued.reset_map(ended.state.at[:size].set(moved), jnp.full(cells, jnp.inf))
                 after = jnp.reshape(transition.state, rows.shape)
                 point, slopes = jnp.where(at_reset, after[0, :size], point), jnp.where(at_reset, after[1:], slopes)
                 mode, is_here = jnp.where(at_reset, transition.mode, mode), is_here & ~at_reset
@@ -366,10 +361,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
 
     def newton(self, cells: int, leaves: tuple[Array, ...]) -> Newton:
         """Newton's iteration of all cells, from the starts."""
-        is_legal, t1, tolerance = legal_run(
-            self.model(leaves).legal() if self.unchecked else True, leaves[0], leaves[-1]
-        )
-        tolerance = jnp.min(tolerance)
+        is_legal, t1, settings = self.event.permitted(self.of_event(leaves))
+        tolerance = settings.tolerance
         finer = jnp.maximum(tolerance / FINER, TIGHTEST)
         size, free = len(self.starts), jnp.asarray(self.free)
         start = jnp.stack([jnp.broadcast_to(leaves[k], (cells,)) for k in self.starts])
@@ -432,34 +425,34 @@ class OrbitSolve(AbstractDifferentiableSolve):
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> tuple[Array, ...]:
         return self.parts_of(self.newton(cells, leaves))
 
-    def parts_of(self, found: Newton) -> tuple[Array, ...]:
+    def parts_of(self, newton: Newton) -> tuple[Array, ...]:
         """The parts of the primal."""
-        values = jnp.linalg.eigvals(found.by_state)
+        values = jnp.linalg.eigvals(newton.by_state)
         order = jnp.argsort(-jnp.abs(values), axis=-1)
         values = jnp.take_along_axis(values, order, axis=-1)[:, : len(self.starts) - (not self.is_driven)]
-        bound = jnp.maximum(SAFETY * found.step, 1e-14 * jnp.max(jnp.abs(found.state), axis=0))
-        singular = jnp.linalg.svd(jnp.eye(len(self.starts)) - found.by_state, compute_uv=False)
-        counts = (jnp.sum(~is_regular(singular), axis=1), found.iterations, found.reason)
-        orbit = (found.time, found.state.T, values.real, values.imag, bound)
-        orbit = [jnp.where(found.reason.reshape(-1, *[1] * (part.ndim - 1)) > 0, jnp.nan, part) for part in orbit]
-        return (*orbit, found.residual, *(count.astype(float) for count in counts))
+        bound = jnp.maximum(SAFETY * newton.step, 1e-14 * jnp.max(jnp.abs(newton.state), axis=0))
+        singular = jnp.linalg.svd(jnp.eye(len(self.starts)) - newton.by_state, compute_uv=False)
+        counts = (jnp.sum(~is_regular(singular), axis=1), newton.iterations, newton.reason)
+        orbit = (newton.time, newton.state.T, values.real, values.imag, bound)
+        orbit = [jnp.where(newton.reason.reshape(-1, *[1] * (part.ndim - 1)) > 0, jnp.nan, part) for part in orbit]
+        return (*orbit, newton.residual, *(count.astype(float) for count in counts))
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[tuple[Array, ...], list[Any]]:
         if nested:
             raise ValueError("second derivatives of periodic orbits are not available; take differences of a gradient")
-        found, size, free = self.newton(cells, leaves), len(self.starts), jnp.asarray(self.free)
+        newton, size, free = self.newton(cells, leaves), len(self.starts), jnp.asarray(self.free)
         others = tuple(k for k in active if k > 0 and k not in self.starts)
-        at_orbit = self.with_start(leaves, found.state)
-        t1 = jnp.where(found.reason > 0, 0.0, leaves[0])
+        at_orbit = self.with_start(leaves, newton.state)
+        t1 = jnp.where(newton.reason > 0, 0.0, leaves[0])
         finer = jnp.maximum(jnp.min(leaves[-1]) / FINER, TIGHTEST)
         last = self.returned(at_orbit, cells, others, finer, t1)
         by_numbers = dict(zip(others, zip(last.by_numbers, last.time_by_numbers, strict=True), strict=True))
-        zeros, changes, matrix = jnp.zeros((cells, size)), {}, jnp.eye(size) - found.by_state
-        is_family = jnp.trace(found.inverse @ matrix[:, :, free], axis1=1, axis2=2) < len(self.free) - 0.5
+        zeros, changes, matrix = jnp.zeros((cells, size)), {}, jnp.eye(size) - newton.by_state
+        is_family = jnp.trace(newton.inverse @ matrix[:, :, free], axis1=1, axis2=2) < len(self.free) - 0.5
         start = jnp.stack([jnp.broadcast_to(leaves[k], (cells,)) for k in self.starts])
-        distance, extent = (jnp.max(jnp.abs(part), axis=0) for part in (found.state - start, found.state))
+        distance, extent = (jnp.max(jnp.abs(part), axis=0) for part in (newton.state - start, newton.state))
         is_vague = is_family & (distance > SAME_ORBIT * extent)
         for k in active:
             fixed, (by, delay) = zeros, by_numbers.get(k, (zeros, jnp.zeros(cells)))
@@ -469,18 +462,18 @@ class OrbitSolve(AbstractDifferentiableSolve):
                 # The start is moved onto the section, and to the nearest orbit of a family.
                 place = self.starts.index(k)
                 unit = zeros.T.at[place].set(1.0)
-                _, moved = jax.jvp(lambda state: self.on_section(leaves, cells, state)[0], (found.state,), (unit,))
-                moved = jnp.where(found.in_motion, moved, unit).T
+                _, moved = jax.jvp(lambda state: self.on_section(leaves, cells, state)[0], (newton.state,), (unit,))
+                moved = jnp.where(newton.in_motion, moved, unit).T
                 fixed = jnp.where(is_family[:, None] | (place not in self.free), moved, 0.0)
             push = by - jnp.einsum("cij,cj->ci", matrix, fixed)
-            change = fixed.at[:, free].add(jnp.einsum("cfn,cn->cf", found.inverse, push))
+            change = fixed.at[:, free].add(jnp.einsum("cfn,cn->cf", newton.inverse, push))
             # There is no derivative if no orbit follows the number.
             back = jnp.einsum("cij,cj->ci", matrix, change)
             sizes = jnp.max(jnp.abs(by) + jnp.abs(change), axis=1) + extent / tangent_scale(leaves[k])
             is_lost = is_vague | (jnp.max(jnp.abs(by - back), axis=1) > SAME_ORBIT * sizes)
             change = jnp.where(is_lost[:, None], jnp.nan, change)
             changes[k] = (delay + jnp.einsum("cn,cn->c", last.time_by_state, change), change)
-        values = self.parts_of(found)
+        values = self.parts_of(newton)
         multipliers = [(None, None)] * len(active)
         if self.with_multipliers:
             multipliers = self._multiplier_slopes(active, cells, at_orbit, values[2] + 1j * values[3], changes)
@@ -521,20 +514,14 @@ def depth(part: Any) -> int:
     return 1 + max(map(depth, part), default=0) if isinstance(part, list | tuple) else np.ndim(part)
 
 
-def is_several(start: object) -> bool:
-    """Whether a start consists of several guesses."""
-    is_pair = isinstance(start, tuple) and len(start) == 2 and all(depth(part) == 2 for part in start)
-    return is_pair or (not isinstance(start, tuple) and depth(start) == 2)
-
-
 def distinct_orbits(system: object, guesses: Any, event: Any, options: dict[str, Any]) -> list[Orbit]:
     """The distinct orbits that several guesses lead to, in the order of the guesses."""
     require_outside((system, guesses), "periodic_orbit of several guesses", "jax.vmap of periodic_orbit")
     guesses = jax.tree.map(as_number, guesses if isinstance(guesses, tuple) else jnp.asarray(guesses, float))
-    found = jax.vmap(lambda guess: periodic_orbit(system, guess, event, **options))(guesses)
+    batch = jax.vmap(lambda guess: periodic_orbit(system, guess, event, **options))(guesses)
     orbits: list[Orbit] = []
-    for k in np.flatnonzero(np.asarray(found.reason) == 0):
-        orbit = jax.tree.map(lambda part, k=k: part[k], found)
+    for k in np.flatnonzero(np.asarray(batch.reason) == 0):
+        orbit = jax.tree.map(lambda part, k=k: part[k], batch)
         values = np.append(orbit.state, orbit.period)
         others = [np.append(other.state, other.period) for other in orbits]
         if not any(np.allclose(values, other, SAME_ORBIT, SAME_ORBIT) for other in others):
@@ -609,7 +596,8 @@ def periodic_orbit(
     """
     if period is not None and event is not None:
         raise ValueError("event and period: pass the section or the period of a drive, not both")
-    if is_several(start):
+    # A tuple consists of coordinates and rates.
+    if all(depth(part) == 2 for part in start) if isinstance(start, tuple) else depth(start) == 2:
         options = {"free": free, "symmetry": symmetry, "direction": direction, "t1": t1, "tolerance": tolerance}
         return distinct_orbits(system, start, event, options | {"period": period, "solver": solver})
     model: Any = model_of(system, start, section_of(event, direction, "after"))

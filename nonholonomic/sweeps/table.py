@@ -308,8 +308,8 @@ class Table(eqx.Module):
         **Arguments:** `unit`: as for `plot`, checked; `names`: the variables, or `None` for the first.
         """
         # A component is named by its vector, but names may contain a dot.
-        given = [next(iter(self.variables)) if name is None else str(name) for name in names]
-        chosen = [name if name in self.variables else name.partition(".")[0] for name in given]
+        columns = [next(iter(self.variables)) if name is None else str(name) for name in names]
+        chosen = [name if name in self.variables else name.partition(".")[0] for name in columns]
         if not unit or not all(name in self.variables for name in chosen):
             return self
         kept = [*dict.fromkeys(chosen), *self.coords]

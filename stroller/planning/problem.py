@@ -19,6 +19,7 @@ from nonholonomic.validation import (
     as_number,
     is_traced,
     largest,
+    require,
     require_all,
     require_kind,
     require_scalars,
@@ -735,7 +736,7 @@ def checked_problem(
     why = "limits; no plan can keep a limit that is broken at its ends"
     for owner, part, name in (("launch", launch, "steering"), ("launch", launch, "speed"), ("goal", goal, "speed")):
         low, high = limits.ranges().get(name, (None, None))
-        require_all([Bound(getattr(part, name), f"{owner}.{name}", at_least=low, at_most=high, why=why)])
+        require(getattr(part, name), f"{owner}.{name}", at_least=low, at_most=high, why=why)
     for name, gaps in problem.gaps_at_ends.items():
         if gaps.min(initial=np.inf) <= 0.0:
             nearest = int(np.argmin(gaps))

@@ -133,3 +133,16 @@ def after_impact(sleigh, heading, speed, time):
     later = phase + k * (time - impact)
     turn = 2.0 * top / k * (jnp.arctan(jnp.tanh(later / 2.0)) - jnp.arctan(jnp.tanh(phase / 2.0)))
     return jnp.stack([heading + turn, top * jnp.sqrt(turning / m) * jnp.tanh(later), top / jnp.cosh(later)])
+
+
+class Pendulum(AbstractSystem):
+    """A mass on a rod, by its angle."""
+
+    length: float = 1.0
+    dimension = 1
+
+    def metric(self, q):
+        return jnp.array([[self.length**2]])
+
+    def potential(self, q):
+        return -GRAVITY * self.length * jnp.cos(q[0])

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from own_modes import GRAVITY
+from own_modes import GRAVITY, Pendulum
 from scipy.special import ellipk
 
 import tippe
-from nonholonomic import AbstractMode, AbstractSystem, Hybrid, periodic_orbit
+from nonholonomic import AbstractMode, Hybrid, periodic_orbit
 
 
 class Kicked(AbstractMode):
@@ -193,17 +193,6 @@ def test_a_ball_on_a_vibrating_table():
     just_after = [amplitude * np.sin(phase), speed]
     with pytest.raises(ValueError, match="a reset falls on the end of the period; shift the phase"):
         periodic_orbit(Hybrid([Table(amplitude, frequency, restitution, phase)]), just_after, period=period)
-
-
-class Pendulum(AbstractSystem):
-    length: float = 1.0
-    dimension = 1
-
-    def metric(self, q):
-        return jnp.array([[self.length**2]])
-
-    def potential(self, q):
-        return -GRAVITY * self.length * jnp.cos(q[0])
 
 
 def turning(t, y):

@@ -8,27 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from own_modes import Ball as Bouncing
-from own_modes import Sleigh
+from own_modes import Pendulum, Sleigh
 from scipy.spatial.transform import Rotation
 
 import nonholonomic
-from nonholonomic import AbstractMode, AbstractSystem, Hybrid, simulate
+from nonholonomic import AbstractMode, Hybrid, simulate
 from nonholonomic.runs import model_of
 from nonholonomic.runs.trajectory import Trajectory, drawn_by, page_of
 from nonholonomic.views import Ball, Box, Disc, Line, Wheel
 
 SLEIGH = ([0.0, 0.0, 0.3], [0.5 * np.cos(0.3), 0.5 * np.sin(0.3), 2.0])
-
-
-class Pendulum(AbstractSystem):
-    length: float = 1.0
-    dimension = 1
-
-    def metric(self, q):
-        return jnp.array([[self.length**2]])
-
-    def potential(self, q):
-        return -9.81 * self.length * jnp.cos(q[0])
 
 
 def pendulum(system, t, y):
