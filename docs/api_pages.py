@@ -90,7 +90,10 @@ PAGES = {
         "Times, derivatives and stability",
         "Differentiable times of events, Lyapunov exponents and steady states.",
         [
-            *of("nonholonomic", "event_time crossings periodic_orbit Orbit lyapunov_exponent"),
+            *of(
+                "nonholonomic",
+                "event_time crossings periodic_orbit Orbit lyapunov_exponent lyapunov_spectrum LyapunovSpectrum",
+            ),
             *of(
                 "tippe",
                 "inversion_time reversal_time extended_inversion_time lyapunov_exponent LyapunovExponent steady",

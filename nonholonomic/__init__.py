@@ -37,7 +37,9 @@ from .runs.identify import EventTimes as EventTimes
 from .runs.identify import Recording as Recording
 from .runs.identify import identify as identify
 from .runs.identify import log_density as log_density
+from .runs.lyapunov import LyapunovSpectrum as LyapunovSpectrum
 from .runs.lyapunov import lyapunov_exponent as lyapunov_exponent
+from .runs.lyapunov import lyapunov_spectrum as lyapunov_spectrum
 from .runs.orbit import Orbit as Orbit
 from .runs.orbit import periodic_orbit as periodic_orbit
 from .runs.simulate import simulate as simulate

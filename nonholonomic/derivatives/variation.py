@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import partial_eval
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from ..compilation.tracing import dependent_outputs
 from ..compilation.xla_cpu import traced_once
@@ -326,29 +326,27 @@ def in_groups(run: Callable[..., tuple[PyTree, list[PyTree]]], tangents: Tangent
     return jax.tree.map(lambda leaf: leaf[0], results), tangent_slopes[: len(tangents)]
 
 
-# The largest Lyapunov exponent of a problem: the mean rate at which nearby runs diverge, by the variational equation.
+# Lyapunov exponents of a problem: the mean rates at which nearby runs diverge, by the variational equation.
 #
-# A tangent w is integrated along with the state y' = f(y). It is kept at unit length while it follows the linearised
-# motion (Benettin et al., Meccanica 15 (1980) 9, with the renormalisation made continuous), and the logarithm removed by
-# the renormalisation is added up: w' = J w - g w, g = (w . J w) / (w . w), growth' = g, where J w is a Jacobian-vector
-# product of f. Tangents and lengths are those of the state in units of the problem's magnitudes.
+# Tangents w are integrated along with the state y' = f(y): w' = J w, where J w is a Jacobian-vector product of f. After each of
+# many intervals of time they are orthonormalised, and the logarithms of the lengths that this removes are added up (Benettin et
+# al., Meccanica 15 (1980) 9). Tangents and lengths are those of the state in units of the problem's magnitudes.
 
 
 class VariedProblem(AbstractDerivedProblem):
-    """A problem without its event, extended by a tangent and the logarithm of its growth.
+    """A problem without its event, extended by a tangent of length 1, w' = J w - g w with g = (w . J w) / (w . w), and the
+    logarithm of its growth, the integral of g.
 
     **Arguments:**
 
     - `problem`: a problem.
     - `states`: the problem's state, the tangent and the growth of every cell.
     - `magnitudes`: magnitudes of the problem's own components.
-    - `begin`: the time of the problem [s] at the start.
     """
 
     problem: AbstractProblem
     states: Float[Array, "twice_components_and_one cells"]
     magnitudes: Float[Array, "components cells"]
-    begin: Float[Array, ""] | None = None
 
     ends_on_event = False
 
@@ -357,7 +355,7 @@ class VariedProblem(AbstractDerivedProblem):
         return self.states, jnp.concatenate([self.magnitudes, unit_scales])
 
     def field(self, time: Lanes, state: States) -> States:
-        time, y, w = self.clock(time), self.inner(state), state[len(self.magnitudes) : -1]
+        y, w = self.inner(state), state[len(self.magnitudes) : -1]
         rate, carried = jax.jvp(lambda point: self.problem.field(time, point), (y,), (w * self.magnitudes,))
         carried = carried / self.magnitudes
         growth = jnp.sum(w * carried, axis=0) / jnp.sum(w * w, axis=0)
@@ -365,14 +363,6 @@ class VariedProblem(AbstractDerivedProblem):
 
     def inner(self, state: States) -> Float[Array, "inner *lanes"]:
         return state[: len(self.magnitudes)]
-
-    def clock(self, time: Lanes) -> Lanes:
-        return time if self.begin is None else time + self.begin
-
-    def jumps(self, time: Lanes, state: States) -> Jumps | None:
-        jumps = super().jumps(time, state)
-        begin = 0.0 if self.begin is None else self.begin
-        return None if jumps is None else jumps._replace(times=jumps.times - begin)
 
 
 def probed(problem: AbstractProblem) -> VariedProblem:
@@ -387,20 +377,112 @@ def probed(problem: AbstractProblem) -> VariedProblem:
     return VariedProblem(problem, states, magnitudes)
 
 
-def continued(before: PyTree, after: PyTree) -> tuple[Bool[np.ndarray, " cells"], PyTree]:
-    """The runs that had not ended before, and how all runs have ended.
+class FramedProblem(AbstractDerivedProblem):
+    """A problem without its event, extended by tangents.
 
-    **Arguments:** `before`, `after`: the outcomes of the runs, and of their continuations for another interval of time.
+    **Arguments:**
+
+    - `problem`: a problem.
+    - `states`: the problem's state and the tangents of every cell, in turn.
+    - `magnitudes`: magnitudes of the problem's own components.
+    - `begin`: the time of the problem [s] at the start.
     """
-    alive = np.isin(before.status, (RUNNING, REACHED_END))
-    added = {name: getattr(before, name) + getattr(after, name) for name in ("end_time", "steps", "rejected")}
-    return alive, jax.tree.map(lambda new, old: np.where(alive, new, old), after._replace(**added), before)
+
+    problem: AbstractProblem
+    states: Float[Array, "all cells"]
+    magnitudes: Float[Array, "components cells"]
+    begin: Float[Array, ""]
+
+    ends_on_event = False
+
+    def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
+        return self.states, jnp.tile(self.magnitudes, (len(self.states) // len(self.magnitudes), 1))
+
+    def field(self, time: Lanes, state: States) -> States:
+        time, size = self.clock(time), len(self.magnitudes)
+        point, *tangents = (state[k : k + size] for k in range(0, len(state), size))
+        rate, carried = jax.linearize(lambda point: self.problem.field(time, point), jnp.asarray(point))
+        return jnp.concatenate([rate, *map(carried, tangents)])
+
+    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
+        return state[: len(self.magnitudes)]
+
+    def clock(self, time: Lanes) -> Lanes:
+        return time + self.begin
+
+    def jumps(self, time: Lanes, state: States) -> Jumps | None:
+        jumps = super().jumps(time, state)
+        return None if jumps is None else jumps._replace(times=jumps.times - self.begin)
+
+
+#: Tangents are orthonormalised before one grows or shrinks by more than e to this power: so much of their digits is lost.
+MOST_GROWTH = 15.0
+
+#: The most intervals in a stretch.
+MOST_INTERVALS = 4096
+
+
+def orthonormalised(
+    tangents: Float[Array, "tangents components cells"],
+) -> tuple[Float[Array, "tangents cells"], Float[Array, "tangents components cells"]]:
+    """The logarithms of the lengths of tangents, each without its part along those before it, and these parts at length 1."""
+    frame, factors = jnp.linalg.qr(jnp.moveaxis(tangents, -1, 0).mT)
+    return jnp.log(jnp.abs(jnp.diagonal(factors, axis1=-2, axis2=-1))).T, jnp.moveaxis(frame.mT, 0, -1)
+
+
+def in_stretches(
+    advance: Callable[[PyTree, float, float], tuple[Float[Array, "tangents cells"], PyTree, Any]],
+    state: PyTree,
+    t1: float,
+    stretches: int,
+) -> tuple[Float[np.ndarray, "stretches tangents cells"], Any]:
+    """The growth of tangents in equal stretches of time, and how the runs have ended.
+
+    **Arguments:** `advance`: (runs with tangents of length 1, time [s], duration [s]) -> the logarithms of the growth of the
+    tangents, the runs with tangents of length 1, and the outcome; `state`: the runs at the start.
+    """
+    logarithms: list[Float[np.ndarray, "tangents cells"]] = []
+    ending: Any = None
+    intervals = 1
+    with Progress(stretches, "stretch") as display:
+        while (number := len(logarithms)) < stretches:
+            runs, ended, total = state, ending, np.zeros(())
+            duration = t1 / (stretches * intervals)
+            for interval in range(intervals):
+                begin = number * t1 / stretches + interval * duration
+                logarithm, runs, outcome = advance(runs, begin, duration)
+                alive = np.True_
+                if ended is not None:
+                    # Runs that had ended stay as they were.
+                    alive = np.isin(ended.status, (RUNNING, REACHED_END))
+                    sums = {"end_time", "steps", "rejected", "counts"} & set(outcome._fields)
+                    added = {name: getattr(ended, name) + getattr(outcome, name) for name in sums}
+                    outcome = jax.tree.map(lambda new, old: np.where(alive, new, old), outcome._replace(**added), ended)  # noqa: B023
+                ended, logarithm = outcome, np.where(alive, logarithm, 0.0)
+                total = total + logarithm
+                largest = np.max(np.abs(logarithm), initial=0.0, where=np.isfinite(logarithm))
+                if largest > MOST_GROWTH and intervals < MOST_INTERVALS:
+                    intervals *= 2
+                    break
+            else:
+                logarithms.append(total)
+                state, ending = runs, ended
+                # The first stretch compiles.
+                if number == 0:
+                    display.begin(1)
+                else:
+                    display.advance(1)
+    return np.stack(logarithms), ending
 
 
 def growth(
-    problem: AbstractProblem, tangents: Float[Array, "components cells"], t1: float, stretches: int, settings: Settings
-) -> tuple[Float[np.ndarray, "stretches cells"], Outcome]:
-    """Integrate every cell of a problem together with a tangent.
+    problem: AbstractProblem,
+    tangents: Float[Array, "tangents components cells"],
+    t1: float,
+    stretches: int,
+    settings: Settings,
+) -> tuple[Float[np.ndarray, "stretches tangents cells"], Outcome]:
+    """Integrate every cell of a problem together with tangents.
 
     **Arguments:**
 
@@ -410,37 +492,40 @@ def growth(
     - `stretches`: number of time intervals; the growth is returned for each.
     - `settings`: their solver must be an explicit Runge-Kutta solver of Diffrax.
 
-    **Returns:** the logarithm of the growth in each interval, 0 after a run has ended; and the `Outcome`.
+    **Returns:** the logarithm of the growth of each tangent in each interval, without its part along the tangents before it, 0
+    after a run has ended; and the `Outcome`.
 
     **Example:** neighbouring runs of a decay approach each other.
 
     >>> from nonholonomic.derivatives import growth
-    >>> logarithm, outcome = growth(Decays(jnp.array([1.0, 2.0])), jnp.ones((1, 2)), 8.0, 2, settings)
-    >>> print(logarithm.round(6))
+    >>> logarithm, outcome = growth(Decays(jnp.array([1.0, 2.0])), jnp.ones((1, 1, 2)), 8.0, 2, settings)
+    >>> print(logarithm[:, 0].round(6))
     [[-4. -8.]
      [-4. -8.]]
     """
     start, magnitudes = problem.start()
     size, cells = start.shape
-    stretch, direction = jnp.asarray(t1 / stretches), tangents / magnitudes
-    logarithms: list[Float[np.ndarray, " cells"]] = []
-    ending: Any = None
-    with Progress(stretches, "stretch") as display:
-        for number in range(stretches):
-            unit = direction / jnp.linalg.norm(direction, axis=0)
-            states = jnp.concatenate([start, unit, jnp.zeros((1, cells))])
-            variational = VariedProblem(problem, states, magnitudes, number * stretch)
-            outcome, _ = solve_ensemble(variational, stretch, jnp.asarray(cells), settings)
-            start, direction, logarithm = outcome.state[:size], outcome.state[size:-1], outcome.state[-1]
-            outcome = outcome._replace(state=start)
-            alive, ending = (True, outcome) if number == 0 else continued(ending, outcome)
-            logarithms.append(np.where(alive, logarithm, 0.0))
-            # The first interval compiles.
-            if number == 0:
-                display.begin(1)
-            else:
-                display.advance(1)
-    return np.stack(logarithms), ending
+
+    def advance(
+        states: Array, begin: float, duration: float
+    ) -> tuple[Float[Array, "tangents cells"], Float[Array, "all cells"], Outcome]:
+        framed = FramedProblem(problem, states, magnitudes, jnp.asarray(begin))
+        outcome, _ = solve_ensemble(framed, jnp.asarray(duration), jnp.asarray(cells), settings)
+        logarithm, states = _with_unit_tangents(jnp.asarray(outcome.state), magnitudes)
+        return logarithm, states, outcome._replace(state=outcome.state[:size])
+
+    _, states = _with_unit_tangents(jnp.concatenate([start, *tangents]), magnitudes)
+    return in_stretches(advance, states, t1, stretches)
+
+
+@jax.jit
+def _with_unit_tangents(
+    states: Float[Array, "all cells"], magnitudes: Float[Array, "components cells"]
+) -> tuple[Float[Array, "tangents cells"], Float[Array, "all cells"]]:
+    """The logarithms of the growth of tangents, and states with tangents of length 1."""
+    point, *tangents = jnp.split(states, len(states) // len(magnitudes))
+    logarithm, frame = orthonormalised(jnp.stack(tangents) / magnitudes)
+    return logarithm, jnp.concatenate([point, *(frame * magnitudes)])
 
 
 def exponent_of(

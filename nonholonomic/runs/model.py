@@ -148,9 +148,9 @@ class AbstractModel(eqx.Module):
     def without_event(self) -> "AbstractModel":
         """The same model without an event that ends a run."""
 
-    def direction(self, cells: int) -> Float[Array, "components cells"]:
+    def direction(self, cells: int, number: int = 0) -> Float[Array, "components cells"]:
         """A generic change of the initial states, tangent to the set of possible states: that when the parameters of the
-        start move in a generic direction."""
+        start move in a generic direction, another one for each `number`."""
         names = [name for name in self.known if name.startswith(("start", "launch"))]
 
         def states(*moving: Array) -> Array:
@@ -160,7 +160,8 @@ class AbstractModel(eqx.Module):
             return moved.modes(cells, jnp.asarray(1e-9), self.comparable, False)[2]
 
         point = tuple(jnp.asarray(self.value(name), float) for name in names)
-        rates = tuple(jnp.cos(1.0 + k) * jnp.maximum(jnp.abs(value), 1.0) for k, value in enumerate(point))
+        sizes = [jnp.maximum(jnp.abs(value), 1.0) for value in point]
+        rates = tuple(jnp.cos(1.0 + k + number * (1.0 + k) ** 2) * size for k, size in enumerate(sizes))
         return jax.jvp(states, point, rates)[1]
 
     # What a state means.

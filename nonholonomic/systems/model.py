@@ -187,8 +187,8 @@ class OwnModel(AbstractModel):
         system = dataclasses.replace(system, event=None) if isinstance(system, Hybrid) else system
         return OwnModel.of(tree | {"system": system, "event": None})
 
-    def direction(self, cells: int) -> Float[Array, "components cells"]:
-        changes, form = super().direction(cells), self.form
+    def direction(self, cells: int, number: int = 0) -> Float[Array, "components cells"]:
+        changes, form = super().direction(cells, number), self.form
         if not form.traits.projected[form.first]:
             return changes
         entered = form.function("entered", form.first)

@@ -175,10 +175,10 @@ def test_an_exponent_says_how_many_stretches_are_done(monkeypatch):
     def ensemble_solve(problem, stretch, cells, settings):
         time.sleep(0.06)
         times, steps = jnp.ones((3, 3)), jnp.ones((2, 3), int)
-        return Outcome(jnp.full(3, REACHED_END), *times, jnp.ones((5, 3)), *steps, jnp.ones((3, 3))), None
+        return Outcome(jnp.full(3, REACHED_END), *times, jnp.ones((4, 3)), *steps, jnp.ones((3, 3))), None
 
     monkeypatch.setattr(sys.modules["nonholonomic.derivatives.variation"], "solve_ensemble", ensemble_solve)
-    growth(Still(), jnp.ones((2, 3)), 1.0, 8, Settings(1e-6))
+    growth(Still(), jnp.ones((1, 2, 3)), 1.0, 8, Settings(1e-6))
     assert words(terminal)[0] == "compiling"
     assert any("3/8" in text and "stretch/s" in text for _, text in terminal.lines)
     assert "8/8" in left(terminal)

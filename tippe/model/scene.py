@@ -515,11 +515,11 @@ def _mass_from_frame(frame: AbstractFrame, lever: Vector) -> Vector:
     return (-lever[0], -lever[1], -lever[2] - frame.distance)
 
 
-def generic_direction(scene: Scene, launch: Launch, cells: int) -> States:
-    """A generic direction, tangent to the set of states: the body's axes keep their length and right angle, and the
-    vertical keeps length 1; a body that rolls keeps rolling."""
+def generic_direction(scene: Scene, launch: Launch, cells: int, number: int = 0) -> States:
+    """A generic direction, another one for each `number`, tangent to the set of states: the body's axes keep their length and
+    right angle, and the vertical keeps length 1; a body that rolls keeps rolling."""
     magnitudes, state = scene.scales(launch), scene.state(launch)
-    u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
+    u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i + number * (1.0 + i) ** 2) for i in range(8))
     _, e, _, last = parts(state)
     frame, (place, _) = scene.frame, scene.start(launch)
     place = frame.frame_motion(place, (scene.body.size, scene.body.size)).place_rate

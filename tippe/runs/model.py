@@ -157,8 +157,8 @@ class TopModel(AbstractSceneModel):
     def without_event(self) -> "TopModel":
         return TopModel(scene=_integrated(self.scene), launch=self.launch)
 
-    def direction(self, cells: int) -> Float[Array, "components cells"]:
-        return generic_direction(self.scene, self.launch, cells)
+    def direction(self, cells: int, number: int = 0) -> Float[Array, "components cells"]:
+        return generic_direction(self.scene, self.launch, cells, number)
 
     @property
     def roots(self) -> dict[str, PyTree]:

@@ -53,7 +53,8 @@ class Lorenz(AbstractProblem):
 
 def follow(problem, t1, cells, stretches=32):
     directions = jnp.stack([jnp.full(cells, value) for value in (0.3, -0.7, 0.5)])
-    return growth(problem, directions, t1, stretches, Settings(1e-9))
+    logarithm, outcome = growth(problem, directions[None], t1, stretches, Settings(1e-9))
+    return logarithm[:, 0], outcome
 
 
 def test_known_rates_and_a_run_that_ends():

@@ -129,6 +129,8 @@ def test_runs_have_a_lyapunov_exponent(case):
     result = nonholonomic.lyapunov_exponent(case.system, case.start, case.t1, tolerance=1e-7)
     assert np.isfinite(result.exponent)
     assert str(result.status) == "completed"
+    spectrum = nonholonomic.lyapunov_spectrum(case.system, case.start, case.t1, n=1, tolerance=1e-7)
+    assert_close(spectrum.exponents, result.exponent, rtol=1e-9)
 
 
 @of_own_modes

@@ -1,11 +1,13 @@
-"""Lyapunov exponents of users' own mechanical systems with constraints."""
+"""Lyapunov exponents of users' own systems: through constraints and resets, and whole spectra."""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import pytest
 from close import assert_close
 from own_modes import Sleigh
 
-from nonholonomic import AbstractSystem, lyapunov_exponent
+from nonholonomic import AbstractMode, AbstractSystem, Hybrid, lyapunov_exponent, lyapunov_spectrum
 from nonholonomic.runs.model import model_of
 
 
@@ -43,3 +45,72 @@ def test_a_change_of_the_start_obeys_the_constraints():
 
     assert_close(jax.jvp(across, (jnp.concatenate([q, rate]),), (change,))[1], 0.0, atol=1e-14)
     assert jnp.all(jnp.abs(change) > 1e-3)
+
+
+class Lorenz(AbstractMode):
+    drive: float
+
+    def field(self, t, y):
+        return jnp.array([10.0 * (y[1] - y[0]), y[0] * (self.drive - y[2]) - y[1], y[0] * y[1] - 8.0 / 3.0 * y[2]])
+
+
+def test_the_spectrum_of_lorenz():
+    """0.9056, 0 and -14.572, dimension 2.062 (Sprott, Chaos and Time-Series Analysis, 2003); the sum is the divergence."""
+    result = lyapunov_spectrum(Hybrid([Lorenz(28.0)]), [1.0, 1.0, 20.0], t1=500.0, tolerance=1e-7)
+    assert result.status == "completed"
+    assert (np.abs(result.exponents - [0.9056, 0.0, -14.572]) < 3.0 * result.errors).all()
+    assert_close(result.sum, -41.0 / 3.0, rtol=1e-7)
+    assert_close(result.dimension, 2.062, atol=5e-3)
+    assert result.running.shape == (32, 3)
+    assert_close(result.running[-1].sum(), -41.0 / 3.0, rtol=1e-7)
+    assert "sum -13.67 +- " in str(result)
+
+
+class Cat(AbstractMode):
+    """Arnold's cat map once a second, and a component that decays."""
+
+    decay: float
+
+    def field(self, t, y):
+        return jnp.array([0.0, 0.0, 1.0, -self.decay * y[3]])
+
+    def margin(self, t, y):
+        return 1.0 - y[2]
+
+    def reset(self, t, y):
+        return jnp.array([(2.0 * y[0] + y[1]) % 1.0, (y[0] + y[1]) % 1.0, 0.0, y[3]]), 0
+
+
+def test_the_spectrum_through_resets_is_that_of_the_map():
+    """ln((3 + sqrt 5) / 2) and its negative from the map, 0 along the motion, and the rate of decay."""
+    growth = np.log((3.0 + np.sqrt(5.0)) / 2.0)
+    result = lyapunov_spectrum(Hybrid([Cat(0.5)]), [0.3, 0.2, 0.5, 1.0], t1=40.0, tolerance=1e-8)
+    assert_close(result.exponents, [growth, 0.0, -0.5, -growth], atol=1e-6)
+    # The first two alone are the same.
+    result = lyapunov_spectrum(Hybrid([Cat(0.5)]), [0.3, 0.2, 0.5, 1.0], t1=40.0, n=2, tolerance=1e-8)
+    assert_close(result.exponents, [growth, 0.0], atol=1e-6)
+    assert np.isnan(result.dimension)
+
+
+def test_constraints_take_directions_away():
+    """A bead on a rail has two coordinates that may change, and one rate: the others part neither from it nor to it."""
+    start = ([1.0, 0.3], [0.0, 0.0])
+    result = lyapunov_spectrum(Rail(), start, t1=6.0, tolerance=1e-8)
+    assert_close(result.exponents, np.zeros(3), atol=1e-6)
+    with pytest.raises(ValueError, match="n = 4 must be at most 3, the number of independent changes of the start"):
+        lyapunov_spectrum(Rail(), start, t1=6.0, n=4)
+    with pytest.raises(ValueError, match="n = 0 must be a whole number of at least 1"):
+        lyapunov_spectrum(Rail(), start, t1=6.0, n=0)
+
+
+def test_directions_shrink_at_their_own_rates_however_fast():
+    """In a stretch of 1/32 of the run, one shrinks by exp(-125): more than the digits of a number beside the other."""
+    result = lyapunov_spectrum(Hybrid([Decay(40.0)]), [1.0, 1.0], t1=100.0, tolerance=1e-6)
+    assert_close(result.exponents, [0.0, -40.0], rtol=1e-6)
+
+
+class Decay(AbstractMode):
+    rate: float
+
+    def field(self, t, y):
+        return jnp.array([0.0 * y[0], -self.rate * y[1]])
