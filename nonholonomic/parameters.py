@@ -313,9 +313,7 @@ class Parameters(eqx.Module):
 
     def value(self, name: str) -> Array:
         """The value of a parameter; of the first of several."""
-        return next(
-            value for own, value in zip(self.names, self.values, strict=True) if name in (own, of_all_modes(own))
-        )
+        return next(leaf for own, leaf in zip(self.names, self.values, strict=True) if name in (own, of_all_modes(own)))
 
     @property
     def known(self) -> list[str]:

@@ -16,6 +16,9 @@ from .compilation.cache import forget_programs_if_many, is_off
 #: millisecond.
 INTERVAL, TICK, LINGER = 0.5, 0.1, 5.0
 
+#: Where nobody watches, in a log or in the window of an editor, the time [s] after which a call writes a line that stays.
+PATIENCE = 2.0
+
 #: Functions of JAX that run while a program is traced or compiled: module, and start of the function's name.
 COMPILERS = (
     ("jax._src.interpreters.partial_eval", "trace_to_jaxpr"),
@@ -29,8 +32,9 @@ class Progress:
     Use it as a context manager. If contexts are nested, the innermost context that counts items owns the line,
     otherwise the outermost. The line disappears at the end, unless the outermost context counts items.
 
-    A separate thread writes the line, because compiling blocks the caller's thread for many seconds. Nothing is written
-    if standard error is neither a terminal nor a notebook's, or with `NONHOLONOMIC_PROGRESS=0`.
+    A separate thread writes the line, because compiling blocks the caller's thread for many seconds. If standard error is
+    neither a terminal nor a notebook's, the first call that takes longer than 2 s writes a single line, and later calls
+    nothing. With `NONHOLONOMIC_PROGRESS=0`, nothing is written.
     """
 
     #: The process has a single line, because it has one standard error: the calls that have something to show, the outermost
@@ -38,6 +42,7 @@ class Progress:
     _lock = threading.RLock()
     _speakers: ClassVar[list["Progress"]] = []
     _writer: ClassVar[threading.Thread | None] = None
+    _has_told: ClassVar[bool] = False
 
     def __init__(self, total: int | None, unit: str = "", doing: str = "compiling", *, shown: bool = True):
         """Describe the work.
@@ -49,7 +54,8 @@ class Progress:
         - `shown`: whether to show anything at all, including calls within this one.
         """
         self._total, self._unit, self._doing = total, unit, doing
-        self._heard = not is_off("NONHOLONOMIC_PROGRESS") and is_watched()
+        self._watched = is_watched()
+        self._heard = not is_off("NONHOLONOMIC_PROGRESS") and (self._watched or (is_open() and not self._has_told))
         self._shown = shown
         self._done, self._first, self._since, self._notes = 0, 0, None, {}
         self._bar: Any = None
@@ -104,12 +110,18 @@ class Progress:
         if self._bar is not None and time.time() - self._written < INTERVAL:
             return
         self._written = time.time()
+        if not self._watched and (self._has_told or self._written - self._start < PATIENCE):
+            return
         # JAX does not report whether it is tracing or compiling in a thread. The check takes 0.5 ms, twice a second.
         compiling, frame = False, sys._current_frames().get(self._caller)
         while frame is not None and not compiling:
             module, name = frame.f_globals.get("__name__"), frame.f_code.co_name
             compiling = any(module == compiler and name.startswith(begin) for compiler, begin in COMPILERS)
             frame = frame.f_back
+        if not self._watched:
+            Progress._has_told, doing = True, "compiling, the first time only" if compiling else self._doing
+            print(f"nonholonomic: {doing} (NONHOLONOMIC_PROGRESS=0 hides this line)", file=sys.stderr)
+            return
         # Without a delay, tqdm writes the line before everything in it is known.
         options = {"delay": 1e-9, "leave": self._since is not None and not self._inner}
         if self._since is None:
@@ -168,8 +180,12 @@ def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
 def is_watched() -> bool:
     """Whether a status line would be visible: standard error is a terminal, or this process is a notebook."""
     # A closed stream raises an error.
-    is_open = not getattr(sys.stderr, "closed", False)
-    return (is_open and getattr(sys.stderr, "isatty", bool)()) or is_notebook()
+    return (is_open() and sys.stderr.isatty()) or is_notebook()
+
+
+def is_open() -> bool:
+    """Whether this process has a standard error that is not closed."""
+    return sys.stderr is not None and not getattr(sys.stderr, "closed", False)
 
 
 def is_notebook() -> bool:

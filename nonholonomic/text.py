@@ -110,7 +110,8 @@ def likely_fix(value: PyTree, wanted: str = "") -> str:
         return "; nonholonomic.simulate runs a system of your own, and gives gradients to optimise its numbers"
     if wanted == "Scene" and isinstance(value, eqx.Module) and hasattr(value, "mass"):
         return "; put this body into one, as in Scene(body)"
-    return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
+    is_preset = inspect.isfunction(value) and value.__name__ != "<lambda>"
+    return f"; did you mean {value.__name__}()?" if is_preset else ""
 
 
 #: Value of each unit in the SI unit of the same dimension, which a file may have and a picture may show.
@@ -304,13 +305,6 @@ def contents(module: PyTree, with_units: bool = True) -> list[tuple[str, str]]:
     return rows
 
 
-def suspected_gravity(value: float) -> str | None:
-    """A question for an acceleration of free fall [m/s^2] that is greater than on any planet, for warnings."""
-    if value <= 100.0:
-        return None
-    return f"gravity = {value:g} m/s^2 is large: was it in cm/s^2? {value:g} cm/s^2 are {value / 100.0:g} m/s^2"
-
-
 def counted(count: int, noun: str) -> str:
     """A count with its noun, such as "1 number" and "2 numbers"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
@@ -365,9 +359,7 @@ def differences(modules: list[Any], unit: Unit = None) -> list[list[str]]:
                 # 0.1 rad is 5.73 deg, not 5.72958.
                 rounded = np.vectorize(lambda number, factor=factor: float(f"{factor * number:.4g}"), otypes=[float])
                 values = [jax.tree.map(rounded, value) for value in values]
-            texts = [
-                f"no {field.name}" if value is None else f"{field.name} {as_text(value, name)}" for value in values
-            ]
+            texts = [f"no {field.name}" if part is None else f"{field.name} {as_text(part, name)}" for part in values]
             parts = [[text] if len(set(texts)) > 1 else [] for text in texts]
         labels = [label + part for label, part in zip(labels, parts, strict=True)]
     return labels

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import inspect
+import math
 import operator
 import os
 import sys
@@ -17,7 +18,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
+from types import FrameType, MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
@@ -27,7 +28,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .text import as_html, contents, is_users, likely, likely_fix, one_line, shown
+from .text import as_html, contents, is_users, likely, likely_fix, one_line, readable_unit, shown
 
 # Warnings, which point to the user's line.
 
@@ -153,7 +154,10 @@ def require(
         return
     # NumPy would convert these to numbers.
     if value is None or isinstance(value, str | bytes):
-        raise ValueError(f"{name} = {shown(value)} is not a number")
+        hint = ""
+        with contextlib.suppress(ValueError):
+            hint = f": did you mean {float(str(value).replace(',', '.')):g}?"
+        raise ValueError(f"{name} = {shown(value)} is not a number{hint}")
     # JAX transformations rebuild pytrees with placeholders, but constructors must not receive any.
     try:
         numbers = np.asarray(value, dtype=float)
@@ -358,12 +362,35 @@ def require_package(name: str, extra: str, purpose: str) -> None:
         raise ModuleNotFoundError(f"{purpose} needs {name}: pip install 'nonholonomic[{extra}]'", name=name)
 
 
+class Usual(NamedTuple):
+    """The greatest usual magnitude of a number, and other units, with their sizes in its own, in which a greater one may have
+    been given; in radians, such a number may be in degrees, and certainly is beyond `turns`."""
+
+    most: float
+    others: Mapping[str, float] = MappingProxyType({})
+    turns: float = math.inf
+
+    def question(self, name: str, value: object, unit: str) -> str | None:
+        """A question for a concrete number that is greater; `None` for any other."""
+        if (number := largest(value)) <= self.most:
+            return None
+        unit, degrees = f" {readable_unit(unit)}".rstrip(), IN_DEGREES.format(f"{number:g}")
+        if number > 2.0 * math.pi * self.turns:
+            raise ValueError(f"{name} = {shown(value)} must be within [-2 pi, 2 pi]{degrees}")
+        if not self.others:
+            return f"{name} = {number:.4g}{unit} is large{degrees}"
+        words = ", ".join(f"{number:.4g} {other} are {size * number:.4g}{unit}" for other, size in self.others.items())
+        return f"{name} = {number:.4g}{unit} is large: was it in {' or '.join(self.others)}? {words}"
+
+
 class Bound(NamedTuple):
     """A number, its name, and the range in which it is legal; arguments as for `require`."""
 
     # Ranges of a number as the metadata of its field.
     POSITIVE = {"range": {"above": 0.0}}  # noqa: RUF012
     NOT_NEGATIVE = {"range": {"at_least": 0.0}}  # noqa: RUF012
+    # An acceleration of free fall [m/s^2] that is greater than on any planet is suspicious.
+    GRAVITY = POSITIVE | {"usual": Usual(100.0, {"cm/s²": 0.01})}
 
     value: Any
     name: str
@@ -387,30 +414,34 @@ class Bound(NamedTuple):
         return functools.reduce(jnp.logical_and, conditions)
 
 
-Constructor = TypeVar("Constructor", bound=Callable[..., object])
+Function = TypeVar("Function", bound=Callable[..., object])
 
 
-def explaining(constructor: Constructor) -> Constructor:
-    """Let a class method that constructs an object name its arguments where it is called with others, and add the
-    class's advice."""
+def explaining(function: Function, advice: Mapping[str, str] = MappingProxyType({})) -> Function:
+    """Let a function, or a class method that constructs an object, name its arguments where it is called with others, and
+    add advice: its own, or that of the class."""
+    of_class = "." in function.__qualname__
 
-    @functools.wraps(constructor)
-    def explained(cls: Any, *values: object, **named: object) -> object:
+    @functools.wraps(function)
+    def explained(*values: Any, **named: object) -> object:
         try:
-            return constructor(cls, *values, **named)
+            return function(*values, **named)
         except TypeError:
-            function = cls if constructor.__name__ == "__call__" else getattr(cls, constructor.__name__)
-            signature = inspect.signature(function)
+            owner, *arguments = values if of_class else (function, *values)
+            is_method = of_class and function.__name__ != "__call__"
+            called = getattr(owner, function.__name__) if is_method else owner
+            signature = inspect.signature(called)
             try:
-                signature.bind(*values, **named)
+                signature.bind(*arguments, **named)
             except TypeError as error:
                 known = signature.parameters
                 takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values())
                 unknown = [name for name in named if name not in known and not takes_all]
                 wrong = [f"{name} = {shown(named[name])} is not among them{likely(name, known)}" for name in unknown]
-                advice = [cls.advice[name] for name in cls.advice if name in unknown or f"'{name}'" in str(error)]
-                words = [*(wrong or [str(error)]), *dict.fromkeys(advice)]
-                raise TypeError(f"{shown(function)} takes {', '.join(known)}; {'; '.join(words)}") from None
+                advised = getattr(owner, "advice", advice)
+                remarks = [advised[name] for name in advised if name in unknown or f"'{name}'" in str(error)]
+                words = [*(wrong or [str(error)]), *dict.fromkeys(remarks)]
+                raise TypeError(f"{shown(called)} takes {', '.join(known)}; {'; '.join(words)}") from None
             raise
 
     return explained  # pyright: ignore[reportReturnType]
@@ -451,7 +482,14 @@ class Bounded(eqx.Module, metaclass=Explaining):
                     yield Bound(**({"value": part, "name": name} | limits))
 
     def suspicion(self) -> str | None:
-        """A possible mistake in legal numbers, such as another unit, as text; `None` if there is none."""
+        """A possible mistake in legal numbers as text, such as another unit by the `Usual` of a field; `None` if there is
+        none."""
+        fields = (field for field in dataclasses.fields(self) if "usual" in field.metadata)
+        questions = (
+            field.metadata["usual"].question(field.name, getattr(self, field.name), self.units[field.name])
+            for field in fields
+        )
+        return next(filter(None, questions), None)
 
     def __check_init__(self):
         # The module's own numbers are scalars or lists of one length; the arrays of a user's class may have any shapes.

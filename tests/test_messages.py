@@ -46,6 +46,15 @@ class Leaving(nonholonomic.AbstractMode):
         return y + 1.0, 5
 
 
+class Turning(nonholonomic.AbstractSystem):
+    """A flywheel."""
+
+    dimension = 1
+
+    def metric(self, q):
+        return jnp.eye(1)
+
+
 class Nameless(nonholonomic.AbstractSystem):
     """A system without its number of coordinates."""
 
@@ -97,6 +106,30 @@ REFUSED = {
     "more than half a turn in degrees": (
         lambda: tippe.Recording(LAUNCH, [0.1, 0.2], np.radians([6.0, 200.0]), 0.01),
         "theta = 200 deg at 0.2 s (sample 2) must be, with room for its errors, between 0 and 180 deg",
+    ),
+    "a decimal comma": (lambda: tippe.Launch("6,5", 155.0), "theta = '6,5' is not a number: did you mean 6.5?"),
+    "a number as a text": (lambda: tippe.simulate(TOP, LAUNCH, "8"), "t1 = '8' is not a number: did you mean 8?"),
+    "degrees of a box": (
+        lambda: stroller.Box((1.0, 0.3), (0.5, 0.25), 45.0),
+        "angle = 45.0 must be within [-2 pi, 2 pi]; angles are in radians: did you mean np.radians(45)?",
+    ),
+    "a launch for the scene of a table": (
+        lambda: tippe.inversion_table(LAUNCH, TOP, t1=1.0),
+        "scene = Launch(theta=0.1 rad, spin=155 rad/s, eta=0 rad, azimuth=0 rad) must be a Scene",
+    ),
+    "a field of another size than the start": (
+        lambda: nonholonomic.simulate(nonholonomic.Hybrid([Leaving()]), [1.0, 2.0], 1.0),
+        "modes[0].field(t, y) must return an array of shape (2,), like the start, not an array of shape (1,); "
+        "pass a start of 1 number, or return 2 numbers",
+    ),
+    "a number for a list of coordinates": (
+        lambda: nonholonomic.simulate(Turning(), (0.1, 0.0), 1.0),
+        "start: q must be of shape (1,), not (): write [0.1]",
+    ),
+    "a class for a system": (lambda: nonholonomic.simulate(Turning, ([0.1], [0.0]), 1.0), "did you mean Turning(...)?"),
+    "a function for a system": (
+        lambda: nonholonomic.simulate(lambda t, y: -y, [1.0], 1.0),
+        "wrap modes in nonholonomic.Hybrid([...]), and a function in a mode, as its field",
     ),
     "no dimension": (
         lambda: nonholonomic.simulate(Nameless(), ([1.0], [0.0]), t1=1.0),
@@ -490,6 +523,35 @@ CALLED = {
     "revolutions a minute for a spin": (
         lambda: tippe.Launch(theta=0.1, rpm=1200),
         "rpm = 1200 is not among them; Launch takes spin in rad/s, Launch.degrees takes rpm",
+    ),
+    "revolutions a minute for a table": (
+        lambda: tippe.inversion_table(TOP, theta=0.1, rpm=1500, t1=1.0),
+        "rpm = 1500 is not among them; Launch takes spin in rad/s, Launch.degrees takes rpm",
+    ),
+    "a spin for a page": (
+        lambda: tippe.explore(TOP, LAUNCH, spin=155.0),
+        "explore takes scene, launch, path, sliders, t1, unit, label; spin = 155.0 is not among them; a launch has it: "
+        "launch=tippe.Launch(theta, spin), or launch=tippe.Launch.degrees(theta, rpm)",
+    ),
+    "a height for a place": (
+        lambda: tippe.Launch(0.1, 155.0, height=0.01),
+        "a launch touches the arena; place= states",
+    ),
+    "a mass for an axis": (
+        lambda: stroller.sweep(PRAM, RIDE, 1.0, mass=[12.0]),
+        "sweep takes scene, launch, t1,",
+    ),
+    "an end without its name": (
+        lambda: nonholonomic.simulate(Turning(), ([0.1], [0.0])),
+        "simulate takes system, start, t1, times, tolerance, solver, adjoint, input, jumps; missing a required argument: 't1'",
+    ),
+    "an end by another name": (
+        lambda: stroller.simulate(PRAM, RIDE, t=1.0),
+        "t = 1.0 is not among them",
+    ),
+    "no standard error": (
+        lambda: tippe.Recording(LAUNCH, [0.1], [0.1]),
+        "Recording takes launch, times, value, error, quantity, t0, student, side; missing a required argument: 'error'",
     ),
     "a diameter for a radius": (
         lambda: tippe.Top.turned(diameter=0.04, mass=0.02, stem_radius=0.005),

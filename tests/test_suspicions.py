@@ -25,10 +25,13 @@ pytestmark = pytest.mark.oldest
 
 SUSPECTED = {
     "rpm": (lambda: tippe.Launch(0.1, 1500.0), "was it in rpm? 1500 rpm are 157.1 rad/s"),
-    "rpm of some": (lambda: tippe.Launch(0.1, [150.0, -1200.0]), "spin = 1200 rad/s is 1.15e+04 revolutions a minute"),
+    "rpm of some": (
+        lambda: tippe.Launch(0.1, [150.0, -1200.0]),
+        "spin = 1200 rad/s is large: was it in rpm? 1200 rpm are 125.7 rad/s",
+    ),
     "a speed in km/h": (
         lambda: stroller.Launch((0.0, 0.0), 0.0, [1.0, -90.0]),
-        "speed = 90 m/s is fast: was it in km/h? 90 km/h are 25 m/s",
+        "speed = 90 m/s is large: was it in km/h? 90 km/h are 25 m/s",
     ),
     "a steering angle in degrees": (
         lambda: stroller.Launch((0.0, 0.0), 0.0, 1.0, steering=[0.1, -5.0]),
@@ -40,15 +43,15 @@ SUSPECTED = {
     ),
     "a wheelbase in mm": (
         lambda: stroller.Stroller(mass=12.0, wheelbase=700.0, inertia=1e7, steering_inertia=0.05),
-        "wheelbase = 700 m is long: was it in mm? 700 mm are 0.7 m",
+        "wheelbase = 700 m is large: was it in mm or cm? 700 mm are 0.7 m, 700 cm are 7 m",
     ),
     "gravity in cm/s^2": (
         lambda: tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), gravity=981.0),
-        "gravity = 981 m/s^2 is large: was it in cm/s^2? 981 cm/s^2 are 9.81 m/s^2",
+        "gravity = 981 m/s² is large: was it in cm/s²? 981 cm/s² are 9.81 m/s²",
     ),
     "gravity of a stroller in cm/s^2": (
         lambda: stroller.Scene(stroller.Stroller(12.0, 0.7, 1.5, 0.05), gravity=981.0),
-        "gravity = 981 m/s^2 is large: was it in cm/s^2? 981 cm/s^2 are 9.81 m/s^2",
+        "gravity = 981 m/s² is large: was it in cm/s²? 981 cm/s² are 9.81 m/s²",
     ),
     "a mass in g": (
         lambda: tippe.Top.turned(0.021, mass=20.0, cut=0.0155, stem_radius=0.005, stem_length=0.013),
@@ -56,9 +59,9 @@ SUSPECTED = {
     ),
     "friction in per cent": (
         lambda: tippe.Coulomb(27.0, 0.05),
-        "mu = 27 is large for a coefficient of friction: was it in %? 27 % are 0.27",
+        "mu = 27 is large: was it in %? 27 % are 0.27",
     ),
-    "exact friction in per cent": (lambda: tippe.SetValuedCoulomb(27.0), "mu = 27 is large for a coefficient"),
+    "exact friction in per cent": (lambda: tippe.SetValuedCoulomb(27.0), "mu = 27 is large"),
     "a slip speed in mm/s": (
         lambda: tippe.Contensou(0.3, 1e-3, 50.0),
         "slip_speed = 50 m/s is large: was it in mm/s? 50 mm/s are 0.05 m/s",
@@ -87,6 +90,64 @@ SUSPECTED = {
         lambda: tippe.inversion_table(tippe.Scene(rutstam_top()), theta=[0.1], spin=155.0, t1=1.0),
         "friction = Frictionless(): without friction no top turns over",
     ),
+    "whole degrees": (
+        lambda: tippe.Launch(3, 155.0),
+        "theta = 3 rad is large; angles are in radians: did you mean np.rad",
+    ),
+    "whole degrees of several": (lambda: tippe.Launch([2.0, 3.0], 155.0), "did you mean np.radians(3)?"),
+    "degrees of the azimuth": (
+        lambda: tippe.Launch(0.1, 155.0, azimuth=90.0),
+        "azimuth = 90 rad is large; angles are in",
+    ),
+    "radians for degrees": (
+        lambda: tippe.Launch.degrees(0.1, 1500.0),
+        "theta = 0.1 deg is closer to upright than a hand can launch a top: was it in radians? 0.1 rad are 5.73 deg",
+    ),
+    "a velocity in cm/s": (
+        lambda: tippe.Launch(0.1, 155.0, velocity=(0.0, -30.0)),
+        "velocity = 30 m/s is large: was it in cm/s or mm/s? 30 cm/s are 0.3 m/s, 30 mm/s are 0.03 m/s",
+    ),
+    "a slip speed before mu": (
+        lambda: tippe.Coulomb(0.05, 0.3),
+        "slip_speed = 0.3 m/s > mu = 0.05: were they exchanged? usual slip speeds are 0.01 to 0.1 m/s",
+    ),
+    "a slip speed before the radius of contact": (
+        lambda: tippe.Contensou(0.3, 0.05, 1e-3),
+        "contact_radius = 0.05 m is large: was it in mm?",
+    ),
+    "a density for a mass": (
+        lambda: tippe.Top.turned(0.02, mass=700.0, cut=0.015, stem_radius=0.005, stem_length=0.012),
+        "mass = 700 kg is unusual for a top: was it a density? Top.turned takes density",
+    ),
+    "a horizon in ms": (
+        lambda: tippe.inversion_time(TOP, LAUNCH, 8000.0),
+        "t1 = 8000 s is long for a top; times are in seconds: did you mean t1=8?",
+    ),
+    "an error in degrees": (
+        lambda: tippe.Recording(LAUNCH, [0.1, 0.2], [0.1, 0.2], 1.0),
+        "error of theta = 1 rad is large; angles are in radians: did you mean np.radians(1)?",
+    ),
+    "degrees of a slope": (
+        lambda: stroller.Plane(1.0),
+        "tilt = 1 rad is large; angles are in radians: did you mean np.radians(1)?",
+    ),
+    "a grip in per cent": (lambda: stroller.Limits(grip=30.0), "grip = 30 is large: was it in %? 30 % are 0.3"),
+    "a mass of a stroller in g": (
+        lambda: stroller.Stroller(12000.0, 0.7, 1.5, 0.05),
+        "mass = 12000, wheelbase = 0.7, inertia = 1.5 do not fit, as the inertia is usually mass wheelbase^2 / 4",
+    ),
+    "a wheelbase before the mass": (
+        lambda: stroller.Stroller(0.7, 12.0, 1.5, 0.05),
+        "were they exchanged, or not in kg",
+    ),
+    "rad/s of a launch in rpm": (
+        lambda: tippe.inversion_time(TOP, tippe.Launch.degrees(6.0, 155.0), 1.0),
+        "spin = 155 rpm is slow: this top needs about 735 rpm to turn over; was it in rad/s? 155 rad/s are 1480 rpm",
+    ),
+    "turns a second of a launch in rpm": (
+        lambda: tippe.inversion_time(TOP, tippe.Launch.degrees(6.0, 20.0), 1.0),
+        "was it in turns a second? 20 turns a second are 1200 rpm",
+    ),
     "turns a second": (
         lambda: tippe.inversion_time(TOP, tippe.Launch(0.1, -20.0), 1.0),
         "spin = 20 rad/s is slow: this top needs about 76.9 rad/s to turn over; was it in turns a second? "
@@ -105,7 +166,7 @@ SUSPECTED = {
         "theta = 0.0 is exactly upright, where a top stays forever",
     ),
     "some inverted already": (
-        lambda: tippe.inversion_table(TOP, theta=[1.0, 2.0, 3.0], spin=155.0, t1=1.0),
+        lambda: tippe.inversion_table(TOP, theta=[1.2, 2.0, 3.0], spin=155.0, t1=1.0),
         "theta = 3 rad is not below the angle to be reached, 2.985 rad: the top is inverted from the start; "
         "angles are in radians: did you mean np.radians(3)?",
     ),
@@ -159,6 +220,11 @@ def test_python_shows_a_warning_once_for_a_line():
 @pytest.mark.filterwarnings("error")
 def test_what_is_usual_is_not_suspected(nothing_runs):
     tippe.Launch(0.1, [-900.0, 900.0])
+    tippe.Launch.degrees(0.5, 900.0, azimuth=360.0)
+    tippe.Launch(2.5, 155.0)
+    tippe.Launch(2.0, 0.0)
+    tippe.Coulomb(0.1, 0.2)
+    stroller.Stroller(5.0, 0.25, 0.1, 0.005)
     tippe.Scene(rutstam_top(), tippe.Cylinder(10.0))
     stroller.Launch((0.0, 0.0), 6.2, 1.0, steering=-1.5)
     assert tippe.inversion_time(TOP, LAUNCH, 1.0) == jnp.inf

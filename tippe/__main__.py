@@ -60,22 +60,16 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
-    command.add_argument(
-        "--paper", action="store_true", help="the papers' Tables 2 and 3 beside computed times, instead"
-    )
+    command.add_argument("--paper", action="store_true", help="the papers' Tables 2 and 3 beside computed times")
     command.add_argument("--top", choices=list(TOPS), default="wooden", help="one of `tippe.presets`")
-    command.add_argument(
-        "--theta", type=float, nargs="+", default=[3.0, 6.0, 12.0, 18.0], help="inclinations theta(0) [deg]"
-    )
+    command.add_argument("--theta", type=float, nargs="+", default=[3.0, 6.0, 12.0, 18.0], help="theta(0) [deg]")
     command.add_argument("--rpm", type=float, default=1900.0, help="spin at the start [revolutions per minute]")
     command.add_argument("--mu", type=float, nargs="+", default=[0.1, 0.2, 0.3, 0.4, 0.5], help="Coulomb friction [1]")
     command.add_argument("--slip-speed", type=float, default=0.05, help="slip below which friction falls to zero [m/s]")
     command.add_argument("--cylinder-radius", type=float, default=0.3, help="radius of the cylinder [m]")
     command.add_argument("--t1", type=float, default=10.0, help="horizon [s]")
     command.add_argument("--tolerance", type=float, default=1e-6, help="relative tolerance of the integration")
-    command.add_argument(
-        "--out", type=Path, default=Path("tippe-out"), help="folder for the tables, the picture and the page"
-    )
+    command.add_argument("--out", type=Path, default=Path("tippe-out"), help="folder for tables, picture and page")
     return command
 
 
@@ -221,10 +215,7 @@ def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
 
 def headings(options: argparse.Namespace) -> dict[str, str]:
     """The headings of the table of each arena."""
-    return {
-        "plane": "on a table [s]",
-        "cylinder": f"in a cylinder of {100.0 * options.cylinder_radius:g} cm radius [s]",
-    }
+    return {"plane": "on a table [s]", "cylinder": f"in a cylinder of {100 * options.cylinder_radius:g} cm radius [s]"}
 
 
 def report(options: argparse.Namespace, arena: str, table: Table) -> str:

@@ -31,13 +31,14 @@ from nonholonomic.validation import as_number, is_traced, require_kind, require_
 
 from .model.scene import Launch, Scene, as_launch
 from .modes.problems import angle_of, event_of
-from .runs.model import TopModel
+from .runs.model import TopModel, of_launches
 from .runs.verbs import ExtendedTime, beyond_horizon, check_event, check_reversible, check_smooth
 
 #: The words for data that can be fitted.
 EXPECTED = "an InversionTimes, a ReversalTimes or a Recording"
 
 
+@of_launches
 def identify(
     scene: Scene,
     data: Data | Sequence[Data],
@@ -95,6 +96,7 @@ def identify(
     return fit_runs(scene, data, free, EXPECTED, tolerance, search, slopes)
 
 
+@of_launches
 def log_density(
     scene: Scene,
     data: Data | Sequence[Data],
@@ -268,6 +270,7 @@ class ReversalTimes(AbstractTimes):
         return TopModel.timed(system, self.launch, None)
 
 
+@of_launches
 def read_inversion_times(
     path: str | PathLike[str],
     columns: Mapping[str, object] | None = None,
@@ -409,9 +412,7 @@ class Recording(AbstractRecording):
         is_outside = seen & ((theta < -reach) | (theta > math.pi + reach))
         for row in np.flatnonzero(is_outside)[:1]:
             number, degrees = f"{theta[row]:g}", math.degrees(theta[row])
-            hint = (
-                f"pi rad: was it recorded in degrees? Pass np.radians({number}), or the unit 'deg' when you read a file"
-            )
+            hint = f"pi rad: was it recorded in degrees? Pass np.radians({number}), or the unit 'deg' with a file"
             # Radians of round degrees were in degrees before.
             if abs(degrees - round(degrees, 3)) < 1e-9:
                 number, hint = f"{degrees:g} deg", "180 deg"
@@ -419,6 +420,7 @@ class Recording(AbstractRecording):
             raise ValueError(f"theta = {place} must be, with room for its errors, between 0 and {hint}")
 
 
+@of_launches
 def read_recording(
     path: str | PathLike[str],
     columns: Mapping[str, object] | None = None,

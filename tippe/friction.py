@@ -15,7 +15,7 @@ from nonholonomic.compilation.components import held, map_methods
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
 from nonholonomic.text import one_line, shown
-from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, as_number, is_traced, largest, require_kind
+from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, Usual, as_number, is_traced, largest, require_kind
 
 # Argument and result of a friction law: the motion at the contact, and force and torque per unit normal force.
 
@@ -58,8 +58,13 @@ A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.
 #: What to do where an argument of Coulomb's law is missing.
 ADVICE = {"slip_speed": "usual slip speeds are 0.01 to 0.1 m/s, as in slip_speed=0.05"}
 
-#: A coefficient of friction, and a slip speed [m/s], above which another unit is suspected.
-GREATEST_MU, GREATEST_SLIP_SPEED = 5.0, 5.0
+#: Slip speeds [m/s] above which mu and the slip speed may have been exchanged, and above which another unit is suspected.
+USUAL_SLIP_SPEED, GREATEST_SLIP_SPEED = 0.2, 5.0
+
+#: Ranges of the numbers of the laws, and above which another unit is suspected.
+FRICTION = Bound.NOT_NEGATIVE | {"usual": Usual(5.0, {"%": 0.01})}
+SLIP_SPEED = Bound.POSITIVE | {"usual": Usual(GREATEST_SLIP_SPEED, {"mm/s": 1e-3})}
+CONTACT = Bound.NOT_NEGATIVE | {"usual": Usual(0.02, {"mm": 1e-3})}
 
 #: Slip speeds [m/s] and turning rates [rad/s] at which a law is tried.
 SPEEDS, TURNINGS = (1e-3, 1e-2, 0.1, 1.0), (0.0, 100.0, -100.0)
@@ -111,12 +116,10 @@ class AbstractFriction(Bounded):
         is_own = str(type(self).per_normal_force.__module__).startswith("tippe.")
         if not is_own:
             return None if is_traced(self) else drive(as_law(self))
-        mu = largest(getattr(self, "mu", 0.0)) if self.units.get("mu") == "1" else 0.0
-        if mu > GREATEST_MU:
-            return f"mu = {mu:g} is large for a coefficient of friction: was it in %? {mu:g} % are {mu / 100.0:g}"
-        if (speed := largest(getattr(self, "slip_speed", 0.0))) > GREATEST_SLIP_SPEED:
-            return f"slip_speed = {speed:g} m/s is large: was it in mm/s? {speed:g} mm/s are {speed / 1e3:g} m/s"
-        return None
+        mu, speed = (largest(getattr(self, name, 0.0)) for name in ("mu", "slip_speed"))
+        if max(USUAL_SLIP_SPEED, mu) < speed <= GREATEST_SLIP_SPEED:
+            return f"slip_speed = {speed:g} m/s > mu = {mu:g}: were they exchanged? {ADVICE['slip_speed']}"
+        return super().suspicion()
 
     @abc.abstractmethod
     def per_normal_force(self, slip: Slip) -> ContactLoad:
@@ -216,8 +219,8 @@ class Coulomb(AbstractFriction):
     advice: ClassVar[dict[str, str]] = ADVICE
     isotropic: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
-    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=FRICTION)
+    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=SLIP_SPEED)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + self.slip_speed * self.slip_speed)
@@ -260,9 +263,9 @@ class Contensou(AbstractFriction):
     uses_spin: ClassVar[bool] = True
     isotropic: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
-    contact_radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
-    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=FRICTION)
+    contact_radius: Float[Array, "..."] = eqx.field(converter=as_number, metadata=CONTACT)
+    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=SLIP_SPEED)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         lever = 3.0 * math.pi / 16.0 * self.contact_radius
@@ -305,9 +308,7 @@ class Rolling(AbstractFriction):
     def __check_init__(self):
         require_kind(self.sliding, "sliding", AbstractFriction, A_LAW)
         if isinstance(self.sliding, Rolling | NoSlip) or self.sliding.set_valued:
-            raise ValueError(
-                f"sliding = {shown(self.sliding)} must be a sliding law with a force at every slip velocity"
-            )
+            raise ValueError(f"sliding = {shown(self.sliding)} must be a sliding law with a force at every slip")
 
     @property
     def units(self) -> dict[str, str]:
@@ -383,7 +384,7 @@ class SetValuedCoulomb(AbstractFriction):
     units: ClassVar[dict[str, str]] = {"mu": "1"}
     set_valued: ClassVar[bool] = True
 
-    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.NOT_NEGATIVE)
+    mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=FRICTION)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         """The load of a slipping contact; at zero slip, where the law does not define it, the load is 0."""

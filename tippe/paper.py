@@ -100,34 +100,20 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--I3", type=float, help="axial moment of inertia [kg m^2] (default: 2/5 m R^2)")
     scene = command.add_argument_group("the scene")
     scene.add_argument("--cylinder-radius", type=float, default=0.3, help="radius of the cylinder [m]")
-    scene.add_argument(
-        "--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed"
-    )
+    scene.add_argument("--mu", type=float, default=0.3, help="friction, viscous [s/m], or Coulomb with --slip-speed")
     scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
-    scene.add_argument(
-        "--surface",
-        nargs="+",
-        metavar=("NAME", "NUMBER"),
-        help="another arena, by its name and numbers [m, rad]: " + ", ".join(SURFACES),
-    )
+    scene.add_argument("--surface", nargs="+", metavar=("NAME", "NUMBER"), help="another arena: " + ", ".join(SURFACES))
     scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
     launch = command.add_argument_group("the launches")
     launch.add_argument("--theta", type=float, nargs="+", default=list(THETAS), help="inclinations theta(0) [rad]")
     launch.add_argument("--eta", type=float, nargs="+", default=[0.0, math.pi / 2.0], help="places eta(0) [rad]")
     launch.add_argument("--beta1", type=float, default=BETA1, help="I3 w3 at the start [kg m^2/s]")
-    launch.add_argument(
-        "--spin", type=float, help="spin w3 at the start [rad/s] instead of --beta1; --spin=-100 if negative"
-    )
+    launch.add_argument("--spin", type=float, help="spin w3 [rad/s] instead of --beta1; --spin=-100 if negative")
     run = command.add_argument_group("the run")
     run.add_argument("--t1", type=float, default=60.0, help="horizon [s]")
     run.add_argument("--angle", type=float, default=0.95 * math.pi, help="angle that counts as inverted [rad]")
     run.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of the integration")
-    run.add_argument(
-        "--out",
-        type=Path,
-        default=Path("tippe-paper-out"),
-        help="folder for the tables and the picture; use another folder for another run",
-    )
+    run.add_argument("--out", type=Path, default=Path("tippe-paper-out"), help="folder for tables and picture")
     return command
 
 

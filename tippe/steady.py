@@ -76,7 +76,7 @@ def _require_scene_of_a_top(scene: Scene, any_arena: bool = False) -> None:
     _require_top(scene.body)
     if not (scene.level or any_arena):
         raise ValueError(
-            f"surface = {shown(scene.surface)} must be a Plane without tilt: on other arenas, no top tumbles steadily"
+            f"surface = {shown(scene.surface)} must be a Plane without tilt: elsewhere no top tumbles steadily"
         )
 
 
@@ -86,7 +86,7 @@ def _require_standing(scene: Scene, spin: object, inverted: object) -> None:
     if isinstance(scene.body, AbstractRigidBody):
         kind = type(scene.body).__name__
         raise ValueError(
-            f"body = {kind} must be a body of revolution, such as a Top or a SpheroidBody, to stand and spin"
+            f"body = {kind} must be a body of revolution, such as a Top or SpheroidBody, to stand and spin"
         )
     require(spin, "spin")
     require_flag(inverted, "inverted")
@@ -477,8 +477,6 @@ def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
     """
     shape = np.shape(matrix)
     if len(shape) != 2 or shape[0] != shape[1] or not shape[0]:
-        raise ValueError(
-            f"matrix must be square, not of shape {shape}, as standing_matrix and tumbling_matrix are; {MANY}"
-        )
+        raise ValueError(f"matrix must be square, not of shape {shape}, as standing_matrix is; {MANY}")
     require(matrix, "matrix")
     return jnp.max(jnp.linalg.eigvals(matrix).real)

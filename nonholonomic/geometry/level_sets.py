@@ -191,11 +191,8 @@ class AbstractLevel(AbstractGradientSurface):
 
     def gradient(self, position: Vector) -> Vector:
         x, y, z = position
-        lines = (
-            (lambda x: self.level(x, y, z), x),
-            (lambda y: self.level(x, y, z), y),
-            (lambda z: self.level(x, y, z), z),
-        )
+        level = self.level
+        lines = ((lambda x: level(x, y, z), x), (lambda y: level(x, y, z), y), (lambda z: level(x, y, z), z))
         return tuple(jax.jvp(along, (start,), (jnp.ones_like(start),))[1] for along, start in lines)
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> Vector:

@@ -24,7 +24,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..compilation.components import held, map_methods
 from ..text import shown
-from ..validation import Bound, Bounded, as_number, require
+from ..validation import Bound, Bounded, Usual, as_number, require
 from .vector import (
     Component,
     Vector,
@@ -307,7 +307,10 @@ class Plane(AbstractSurface):
     tilt: Float[Array, "..."] | None = eqx.field(
         converter=none_if_zero,
         default=None,
-        metadata={"range": {"at_least": -math.pi / 2.0, "at_most": math.pi / 2.0, "unit": "rad"}},
+        metadata={
+            "range": {"at_least": -math.pi / 2.0, "at_most": math.pi / 2.0, "unit": "rad"},
+            "usual": Usual(0.9),
+        },
     )
 
     @property
@@ -593,9 +596,7 @@ class Torus(AbstractGradientSurface):
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
-        yield Bound(
-            self.tube, "tube", below=self.ring, why="the radius of the ring: otherwise the tube would intersect itself"
-        )
+        yield Bound(self.tube, "tube", below=self.ring, why="the radius of the ring: else the tube would cut itself")
 
     def from_middle(self, position: Vector) -> Vector:
         """The vector [m] to a position from the nearest point of the circle along the middle of the tube."""

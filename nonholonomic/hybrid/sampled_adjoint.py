@@ -128,9 +128,7 @@ class HybridSampling(AbstractSampling):
         self, built: Built, tangents: tuple[Tangent, ...], options: Options, nested: bool
     ) -> tuple[SampledRun, list[SampledRun]]:
         if nested:
-            raise ValueError(
-                "second derivatives are not available through changes of mode; take differences of a gradient instead"
-            )
+            raise ValueError("second derivatives do not exist through changes of mode; take differences of a gradient")
         tangents, settings = tuple((tangent[0], tangent[2]) for tangent in tangents), options[2]
         return sampled_with_tangents(built, tangents, options[:2], built[2].shape[1], settings, self.counters)
 

@@ -13,8 +13,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..text import SYNONYMS, UNITS, Stated, counted, likely, one_line, readable_unit, shown
-from ..validation import as_number, as_path, require, warn
+from ..text import SYNONYMS, UNITS, Stated, counted, in_unit, likely, one_line, readable_unit, shown, unit_of
+from ..validation import IN_DEGREES, Explaining, as_number, as_path, require, warn
 from .posterior import Measurements
 
 # Only for type checkers: models stand above fits.
@@ -93,7 +93,7 @@ def as_quantity(words: object) -> Any:
     return tuple(words) if isinstance(words, list) else words
 
 
-class AbstractData(Stated):
+class AbstractData(Stated, metaclass=Explaining):
     """A set of data of a fit.
 
     In a fit of runs, it has a method `model(system)` that returns the checked model of the runs; the numbers of its start have
@@ -124,6 +124,9 @@ def numbered(labels: Sequence[Sequence[str]]) -> tuple[str, ...]:
 
 #: Samples of a top or a stroller are usually closer together [s]; others may have times in milliseconds.
 FAR_APART = 5.0
+
+#: Errors of angles [rad] are usually smaller; others may be in degrees.
+LARGE_ERROR = 0.5
 
 
 class AbstractRecording(AbstractData):
@@ -164,7 +167,13 @@ class AbstractRecording(AbstractData):
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number, default=None)
     side: str = eqx.field(static=True, default="before")
-    units: ClassVar[dict[str, str]] = {"times": "s", "t0": "s"}
+
+    @property
+    def units(self) -> dict[str, str]:
+        columns = {self.quantities.units.get(column, "1") for column in self.columns}
+        return {"times": "s", "t0": "s"} | dict.fromkeys(
+            ("value", "error"), columns.pop() if len(columns) == 1 else "1"
+        )
 
     def __check_init__(self):
         if self.side not in ("before", "after"):
@@ -176,9 +185,7 @@ class AbstractRecording(AbstractData):
         require(self.t0, "t0", below=times[-1], why="the last time")
         shape = (len(times), len(self.columns)) if len(self.columns) > 1 else (len(times),)
         if np.shape(self.value) != shape:
-            raise ValueError(
-                f"value must be of shape {shape} for {', '.join(self.columns)}, not {np.shape(self.value)}"
-            )
+            raise ValueError(f"value must be of shape {shape} for {', '.join(self.columns)}: {np.shape(self.value)}")
         seen = ~np.isnan(np.asarray(self.value))
         if not np.any(seen):
             raise ValueError("value must have at least one number; missing samples are NaN")
@@ -192,15 +199,18 @@ class AbstractRecording(AbstractData):
             if np.ndim(self.student) != 0:
                 raise ValueError(f"student must be one number, not of shape {np.shape(self.student)}")
         # Unusual units: samples too far apart for seconds, and angles too large for radians.
+        errors = np.zeros(shape) if self.error is None else np.broadcast_to(self.error, shape)
+        for k, name in enumerate(self.columns):
+            largest = np.nanmax(errors.reshape(len(times), -1)[:, k])
+            if self.quantities.units.get(name) == "rad" and largest > LARGE_ERROR:
+                warn(f"error of {name} = {largest:g} rad is large{IN_DEGREES.format(f'{largest:g}')}")
         if self.quantities.usual and len(times) > 1 and (apart := np.median(np.diff(times))) > FAR_APART:
             warn(f"times: samples are {apart:g} s apart; times are in seconds: did you mean 1e-3 * times?")
         samples = np.abs(np.asarray(self.value)).reshape(len(times), -1)
         for name in (name for name in self.quantities.usual if name in self.columns):
             largest = np.nanmax(samples[:, self.columns.index(name)], initial=0.0)
             if largest > self.quantities.usual[name]:
-                warn(
-                    f"{name} = {largest:g} rad is large; recorded angles are in radians: did you mean np.radians({name})?"
-                )
+                warn(f"{name} = {largest:g} rad is large; recordings are in radians: did you mean np.radians({name})?")
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -234,7 +244,9 @@ class AbstractRecording(AbstractData):
     @property
     def labels(self) -> tuple[str, ...]:
         """A label for each sample, such as `theta(0.1 s)`; missing samples are omitted."""
-        all_labels = [f"{column}({time:.4g} s)" for time in np.asarray(self.times) for column in self.columns]
+        unit, factor = in_unit("s", unit_of(self))
+        times = factor * np.asarray(self.times)
+        all_labels = [f"{column}({time:.4g} {unit})" for time in times for column in self.columns]
         return tuple(all_labels[i] for i in self.seen)
 
     def units_of(self, model: "AbstractModel") -> tuple[str, ...]:
@@ -318,7 +330,7 @@ class TextTable(NamedTuple):
             raise ValueError(f"decimal = {shown(decimal)} must be '.' or ','")
         if columns is not None and (not isinstance(columns, Mapping) or not columns):
             raise ValueError(
-                f"columns = {shown(columns)} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}, or None"
+                f"columns = {shown(columns)} must be a dictionary, as {{'theta': ('tilt', 'deg')}}, or None"
             )
         path = as_path(path, "path")
         lines = enumerate(_text(path).splitlines(), start=1)
@@ -342,9 +354,7 @@ class TextTable(NamedTuple):
         for (number, _), row in zip(text, rows, strict=True):
             if len(row) != len(headers):
                 comma = mark == "," and len(row) > len(headers)
-                hint = (
-                    "; to read decimal commas, separate the columns by semicolons and pass decimal=','" if comma else ""
-                )
+                hint = "; to read decimal commas, separate columns by semicolons and pass decimal=','" if comma else ""
                 raise ValueError(f"path = {str(path)!r}: line {number} has {len(row)} cells, not {len(headers)}{hint}")
         cells = {header: [row[k].strip() for row in rows[1:]] for k, header in enumerate(headers)}
         repeated = tuple(header for header in cells if headers.count(header) > 1)
@@ -440,15 +450,11 @@ class TextTable(NamedTuple):
         unit = of_header if unit is None else unit
         if unit is None:
             known = "deg" if si == "rad" else next(iter(UNITS[si]))
-            expected = (
-                f"(header, unit), such as ('tilt', {known!r}), or a header with its unit, such as 'tilt [{known}]'"
-            )
+            expected = f"(header, unit), such as ('tilt', {known!r}), or a header with its unit, as 'tilt [{known}]'"
             if argument == "error":
                 expected = f"(standard error, unit), such as (1.0, {known!r}), or (header of a column of standard errors, unit)"
             if first is not None:
-                expected = (
-                    f"(header, unit), such as ({first!r}, {known!r}), because the header has no unit that is known"
-                )
+                expected = f"(header, unit), such as ({first!r}, {known!r}), because the header has no known unit"
             raise ValueError(f"{argument}: {name!r} = {shown(column)} must be {expected}")
         if not isinstance(unit, str):
             require(unit, f"unit of {name}")
@@ -572,7 +578,7 @@ def read_columns(
     if any(lost := is_sample & np.isnan(times)):
         left_out = counted(int(np.sum(lost)), "line")
         warn(
-            f"path = {str(file.path)!r}: {left_out} without a time left out, the first is line {file.lines[np.argmax(lost)]}"
+            f"path = {str(file.path)!r}: {left_out} without a time left out, first in line {file.lines[np.argmax(lost)]}"
         )
     for k in (k for k, name in enumerate(names) if known[name] == "rad"):
         _, size = file.parts(names[k])
@@ -651,9 +657,7 @@ def read_launches(
     numbers = {name: file.numbers(name) for name in file.columns if name != "time"}
     if isinstance(error, Mapping):
         if set(error) != {"time"}:
-            raise ValueError(
-                f"error = {shown(error)} must be {{'time': (standard error, unit)}} or a number of seconds"
-            )
+            raise ValueError(f"error = {shown(error)} must be {{'time': (standard error, unit)}} or a number [s]")
         errors = file.numbers("time", error=error)
     else:
         require(error, "error", above=0.0)

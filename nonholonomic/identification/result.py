@@ -288,9 +288,7 @@ class Identification:
         verdict, count = self.verdict, self.verdict.starts
         scatter = f"residuals this large have a probability of {verdict.p_value:.2g}"
         if math.isnan(verdict.p_value):
-            scatter = (
-                "residuals cannot test the fit: the errors were estimated from it, or no degree of freedom is left"
-            )
+            scatter = "residuals cannot test the fit: its errors were estimated, or no degree of freedom is left"
         lines = [
             f"-2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
             scatter,
@@ -612,7 +610,7 @@ def sample(
         numbers, covariance = len(density.problem.names), np.asarray(covariance, float)
         if covariance.shape != (numbers, numbers) or not np.all(np.isfinite(covariance)):
             raise ValueError(
-                f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"
+                f"covariance must be finite and of shape {(numbers, numbers)}: the data do not fix all numbers"
             )
         if np.shape(centre) != (numbers,):
             raise ValueError(f"centre = {shown(centre)} must be of shape {(numbers,)}")

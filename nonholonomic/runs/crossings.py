@@ -26,7 +26,7 @@ from ..integration.scheduler import InLanes, LaneScheduler, Recorder, of_cells
 from ..integration.step import try_step
 from ..sweeps import Axis, Table, Variable
 from ..text import shown
-from ..validation import require_outside, require_whole
+from ..validation import explaining, require_outside, require_whole
 from .event import modes_of, near_zero, problem_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
 from .simulate import Samples, mode_at, own_axis
@@ -272,6 +272,7 @@ def section_of(event: Any, direction: str, side: str) -> Callable[..., Any] | No
     return Rise(event) if direction == "rise" else event
 
 
+@explaining
 def crossings(
     system: object,
     start: object,

@@ -25,7 +25,7 @@ from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_r
 from ..parameters import Parameters
 from ..terminal import status_line
 from ..text import described, gathered, likely, name_of, shown
-from ..validation import UNTRACEABLE, as_number, is_traced, nan_unless, warn
+from ..validation import UNTRACEABLE, as_number, explaining, is_traced, nan_unless, warn
 from .model import AbstractModel, Names, Number, Start, check_run, model_of, require_event, settings_for_lanes
 
 
@@ -388,6 +388,7 @@ def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Any, tolerance:
 # The time of an event of any model, as a function for `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
 
+@explaining
 @status_line("simulating")
 def event_time(
     system: object,

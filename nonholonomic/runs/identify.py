@@ -24,7 +24,7 @@ from ..parameters import full_name, require_apart
 from ..sweeps.running import workers
 from ..terminal import status_line
 from ..text import in_unit, likely, shown, unit_of
-from ..validation import as_number, nan_unless, require
+from ..validation import as_number, explaining, nan_unless, require
 from .event import SILENT, time_of_event
 from .model import AbstractModel, check_run, model_of, require_event
 from .simulate import sampled
@@ -441,6 +441,7 @@ Value = TypeVar("Value")
 EXPECTED = "a nonholonomic.Recording or EventTimes"
 
 
+@explaining
 def identify(
     system: object,
     data: Data | Sequence[Data],
@@ -495,6 +496,7 @@ def identify(
     return fit_runs(system, data, free, EXPECTED, tolerance, search)
 
 
+@explaining
 def log_density(
     system: object,
     data: Data | Sequence[Data],

@@ -16,7 +16,7 @@ from ..hybrid.saltation import variational_modes, variational_start
 from ..integration import Outcome, Settings
 from ..integration.problem import Status
 from ..terminal import status_line
-from ..validation import require_outside, require_whole
+from ..validation import explaining, require_outside, require_whole
 from .event import modes_of
 from .model import AbstractModel, check_run, model_of, settings_for_lanes
 
@@ -79,6 +79,7 @@ class LyapunovExponent(NamedTuple):
         )
 
 
+@explaining
 @status_line("simulating")
 def lyapunov_exponent(
     system: object,
@@ -179,6 +180,7 @@ class LyapunovSpectrum(NamedTuple):
         return "\n  ".join([heading, *lines, last + dimension])
 
 
+@explaining
 @status_line("simulating")
 def lyapunov_spectrum(
     system: object,

@@ -18,7 +18,7 @@ from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
 from ..parameters import full_name, numbers, with_numbers
 from ..sweeps import Axis, Quantity, Variable
-from ..text import shown
+from ..text import likely_fix, shown
 from ..validation import ArrayOrList, require_all
 
 #: A single number, or one for each cell.
@@ -126,9 +126,7 @@ class AbstractModel(eqx.Module):
         """Raise `ValueError` unless runs have derivatives; `nested`: second derivatives; `continues`: whether runs
         continue through the event."""
         if nested and not self.smooth:
-            raise ValueError(
-                "second derivatives are not available through resets; take differences of a gradient instead"
-            )
+            raise ValueError("second derivatives do not exist through resets; take differences of a gradient instead")
 
     def for_lanes(self) -> tuple["AbstractModel", bool]:
         """The model in a form that is fastest where runs in transformations share lanes, and whether arrays among its leaves
@@ -255,7 +253,7 @@ def model_of(
     """
     raise ValueError(
         f"system = {shown(system)} must be a tippe.Scene, a stroller.Scene, a nonholonomic.Hybrid or an AbstractSystem; wrap "
-        "modes in nonholonomic.Hybrid([...])"
+        f"modes in nonholonomic.Hybrid([...]), and a function in a mode, as its field{likely_fix(system)}"
     )
 
 
@@ -303,5 +301,5 @@ def require_event(model: AbstractModel, purpose: str = "") -> None:
     """Raise `ValueError` unless the model has an event."""
     if not model.has_event:
         raise ValueError(
-            f"{purpose}event = None: the system has no event of its own; pass event=, a function of time and state"
+            f"{purpose}event = None: the system has none of its own; pass event=, a function of time and state"
         )

@@ -25,7 +25,7 @@ from ..integration import Settings
 from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESOLVED
 from ..terminal import status_line
 from ..text import described, shown
-from ..validation import as_number, is_traced, require_outside
+from ..validation import as_number, explaining, is_traced, require_outside
 from .crossings import SAME, on_margin, section_of
 from .event import Ensemble, EventTime
 from .model import AbstractModel, AbstractSceneModel, check_run, model_of, require_event, settings_for_lanes
@@ -529,6 +529,7 @@ def distinct_orbits(system: object, guesses: Any, event: Any, options: dict[str,
     return orbits
 
 
+@explaining
 @status_line("looking for a periodic orbit")
 def periodic_orbit(
     system: object,
@@ -606,9 +607,7 @@ def periodic_orbit(
     if period is None:
         require_event(model)
         if model.form.traits.depends_on_time:
-            raise ValueError(
-                "event: functions of the system depend on time; pass period=, that of the drive, in place of event="
-            )
+            raise ValueError("event: the system depends on time; pass period=, that of the drive, in place of event=")
     else:
         model = model.without_event()
     horizon = t1 if period is None else period

@@ -18,7 +18,7 @@ from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
 from ..integration.problem import Status, legal_run, require_times
 from ..sweeps import Axis, Variable, axis
 from ..terminal import status_line
-from ..validation import as_known, as_number, is_traced, nan_unless, warn
+from ..validation import as_known, as_number, explaining, is_traced, nan_unless, warn
 from .event import modes_of, problem_of
 from .model import AbstractModel, Names, Number, Start, check_run, model_of, run_of, settings_for_lanes
 from .trajectory import Trajectory
@@ -152,6 +152,7 @@ DEFAULT_TIMES = 201
 SHORT, MEAN = 1e-6, 0.05
 
 
+@explaining
 @status_line("simulating")
 def simulate(
     system: object,

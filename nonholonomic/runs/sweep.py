@@ -24,7 +24,7 @@ from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chun
 from ..sweeps.grid import EQUATIONS, SHOWN_IN, columns
 from ..sweeps.table import cells_with
 from ..text import likely, shown, unit_of
-from ..validation import as_number, require_flag, require_outside, require_whole, warn
+from ..validation import as_number, explaining, require_flag, require_outside, require_whole, warn
 from .event import Ensemble
 from .model import AbstractModel, AbstractSceneModel, Number, check_horizon, model_of, require_event, settings_for_lanes
 from .simulate import Samples
@@ -111,6 +111,7 @@ class Options(NamedTuple):
         return settings_for_lanes(self.tolerance, self.solver, int(self.max_steps))
 
 
+@explaining
 def sweep(
     system: object,
     start: object,
@@ -269,9 +270,7 @@ def full_sensitivities(model: AbstractModel, names: Any, crossing: str) -> list[
         require_event(model, "sensitivities are those of the event's time: ")
         model.require_differentiable(False, crossing == "last")
         if crossing == "both":
-            raise ValueError(
-                "crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time"
-            )
+            raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, those of one time")
     return full_names
 
 
@@ -333,9 +332,7 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
         except ValueError as error:
             named = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
             reason = f"; {'the first is at ' * bool(named)}{named}: {error}"
-        warn(
-            f"{len(illegal)} of {cells} cells are illegal: their results are NaN, and their status is 'illegal'{reason}"
-        )
+        warn(f"{len(illegal)} of {cells} cells are illegal: results are NaN, and their status is 'illegal'{reason}")
     # The coordinates of scenes are regular.
     if "steps" in table and not is_scene:
         steps = np.ravel(table["steps"])

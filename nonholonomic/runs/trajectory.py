@@ -24,7 +24,7 @@ from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown, unit_of
-from ..validation import IN_DEGREES, is_traced, require_all, require_file, require_one_run, times_within
+from ..validation import IN_DEGREES, explaining, is_traced, require_all, require_file, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stages_of
 from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
 from ..views.pages import require_labels
@@ -43,6 +43,7 @@ MOST_STEPS_OF_A_PAGE = 50_000
 OF_MESHES = ("scene.surface.", "scene.body.radius", "scene.body.equatorial", "scene.body.polar", "scene.body.wheelbase")
 
 
+@explaining
 @status_line("writing a page")
 def explore(
     system: object,
@@ -112,7 +113,7 @@ def drawn_by(model: Any, draw: Draw) -> Any:
         return model
     if not callable(draw) or not hasattr(model, "draw"):
         raise ValueError(
-            f"draw = {shown(draw)} must be a function draw(system, t, y) for your own system, and None for a scene"
+            f"draw = {shown(draw)} must be a function draw(system, t, y) for an own system, None for a scene"
         )
     return dataclasses.replace(model, **{"draw": draw})
 
@@ -545,9 +546,7 @@ class Trajectory(AbstractRun):
         **Raises:** `ValueError` inside transformations and for a batch of runs: `mode` and `switches` are there.
         """
         if not self._is_one_run:
-            raise ValueError(
-                "resets takes one run outside jit, vmap and grad; run.mode and run.switches work there too"
-            )
+            raise ValueError("resets takes one run outside jit, vmap and grad; run.mode and run.switches work there")
         resets = []
         if not self.model.smooth and int(self.switches):
             modes, first, states = self.model.without_event().modes(1, self.settings.tolerance, None, False)

@@ -19,7 +19,7 @@ from ..compilation.components import spelled_out
 from ..compilation.tracing import dependent_outputs, is_elementary, jumps_of, named_errors, warn_of_unclear
 from ..compilation.xla_cpu import Function, equations_in, traced
 from ..parameters import TreeForm
-from ..text import described, shown
+from ..text import counted, described, shown
 from ..validation import as_number, is_traced, require, warn
 from .mechanics import AbstractFormulation, AbstractMode, AbstractSystem, Lagrange, State, components_of, exit_of
 
@@ -83,9 +83,7 @@ class Hybrid(eqx.Module):
         if self.event is not None:
             require_event(self.event)
         if not isinstance(self.first, int) or not 0 <= self.first < len(self.modes):
-            raise ValueError(
-                f"first = {shown(self.first)} must be the number of a mode, from 0 to {len(self.modes) - 1}"
-            )
+            raise ValueError(f"first = {shown(self.first)} must be the number of a mode, 0 to {len(self.modes) - 1}")
 
 
 # The form of a system: what is left without its numbers.
@@ -246,9 +244,10 @@ def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> 
     function_name, result = _name(name, mode), _result(form, name, mode)
     if not hasattr(result, "shape") or result.shape != shape:
         expected = "one number" if shape == () else f"an array of shape {shape}, like the start"
-        raise ValueError(
-            f"{function_name} must return {expected}, not {described(result)}; jnp.array([...]) makes an array of numbers"
-        )
+        fix = "jnp.array([...]) makes an array of numbers"
+        if hasattr(result, "shape") and len(result.shape) == len(shape) == 1:
+            fix = f"pass a start of {counted(result.shape[0], 'number')}, or return {counted(shape[0], 'number')}"
+        raise ValueError(f"{function_name} must return {expected}, not {described(result)}; {fix}")
     if not jnp.issubdtype(result.dtype, jnp.floating):
         raise ValueError(f"{function_name} must return floats, not {result.dtype}: it must be smooth")
 
@@ -336,7 +335,12 @@ def _check_vector(value: Any, name: str, size: int | None) -> None:
     require(value, name)
     shape = f"({'components' if size is None else size},)"
     if np.ndim(value) != 1 or np.size(value) == 0 or size not in (None, np.size(value)):
-        raise ValueError(f"{name} must be of shape {shape}, not {np.shape(value)}; jax.vmap or sweep runs many")
+        example = (
+            f": write [{shown(value)}]"
+            if np.ndim(value) == 0 and size in (None, 1)
+            else "; jax.vmap or sweep runs many"
+        )
+        raise ValueError(f"{name} must be of shape {shape}, not {np.shape(value)}{example}")
 
 
 @functools.lru_cache(maxsize=256)
@@ -418,9 +422,7 @@ def warn_of_misspelt_methods(part: AbstractMode | AbstractSystem, base: type) ->
         if matches and not name.startswith("_") and not any(name in _names(other.__code__) for other in others):
             warn(f"{kind.__name__}.{name} is never called; did you mean {matches[0]}?")
     if "reset" not in free and "margin" in free:
-        warn(
-            f"{kind.__name__}.reset is never called: write margin as well, which falls to zero where the reset happens"
-        )
+        warn(f"{kind.__name__}.reset is never called: write margin too, which falls to zero where the reset happens")
 
 
 def _names(code: CodeType) -> set[str]:

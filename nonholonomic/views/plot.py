@@ -282,9 +282,7 @@ def column(table: "Table", argument: str, name: object, vectors: bool = False) -
     **Arguments:** `argument`: name of the argument in a message; `vectors`: whether the message lists vectors, too.
     """
     if not isinstance(name, str):
-        raise ValueError(
-            f"{argument} = {shown(name)} must be the name of a quantity, such as {next(iter(table.variables))!r}"
-        )
+        raise ValueError(f"{argument} = {shown(name)} must name a quantity, such as {next(iter(table.variables))!r}")
     variable, _, component = name.partition(".")
     dims = table.inner.get(variable, ())
     if variable in table.variables and not component and not dims:
@@ -294,9 +292,7 @@ def column(table: "Table", argument: str, name: object, vectors: bool = False) -
         name, bracket, unit = table.label(variable).rpartition(" [")
         return table[variable][:, place], f"{name}, {component}{bracket}{unit}" if bracket else f"{unit}, {component}"
     candidates = [variable_name for variable_name in table.variables if vectors or variable_name not in table.inner]
-    candidates += [
-        f"{variable_name}.{part}" for variable_name, dims in table.inner.items() for part in table.coords[dims[0]]
-    ]
+    candidates += [f"{owner}.{part}" for owner, dims in table.inner.items() for part in table.coords[dims[0]]]
     raise ValueError(f"{argument} = {name!r} must be one of {', '.join(candidates)}{likely(name, candidates)}")
 
 

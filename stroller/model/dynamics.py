@@ -20,11 +20,12 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import AbstractSurface, Component, Place, Plane, Vector
 from nonholonomic.geometry.vector import add, cross, dot, multiply, none_if_zero, scale, stacked, subtract, sum_vectors
-from nonholonomic.validation import Bound, Bounded, as_number, largest
+from nonholonomic.validation import Bound, Bounded, Usual, as_number, is_traced, largest
 
 from ..friction import AbstractFriction, Drag, WheelMotion
 from .input import Input, Motion
@@ -33,8 +34,12 @@ State = Float[Array, "components ..."]
 
 # The body: a rigid frame on two rear wheels, with one front wheel in a fork that steers.
 
-#: A wheelbase above this [m], more than any vehicle's, suggests millimetres or centimetres.
-LONGEST = 20.0
+#: The range of a wheelbase [m]; above 20 m, more than any vehicle's, it suggests millimetres or centimetres.
+WHEELBASE = Bound.POSITIVE | {"usual": Usual(20.0, {"mm": 1e-3, "cm": 1e-2})}
+
+#: The usual radius of gyration about the rear axle, in wheelbases.
+GYRATION = (0.15, 10.0)
+ODD = ", as the inertia is usually mass wheelbase^2 / 4: were they exchanged, or not in kg, m and kg m^2?"
 
 
 class Stroller(Bounded):
@@ -66,7 +71,7 @@ class Stroller(Bounded):
     units |= {"steering_spring": "N m rad-1", "centre": "m"}
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
-    wheelbase: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
+    wheelbase: Float[Array, "..."] = eqx.field(converter=as_number, metadata=WHEELBASE)
     inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
     steering_inertia: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
     steering_spring: Float[Array, "..."] | None = eqx.field(
@@ -75,20 +80,19 @@ class Stroller(Bounded):
     centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None, metadata=Bound.NOT_NEGATIVE)
 
     def suspicion(self) -> str | None:
-        longest = largest(self.wheelbase)
-        if longest <= LONGEST:
+        if is_traced(self) or np.ndim(self.mass + self.wheelbase + self.inertia):
             return None
-        unit, metres = ("mm", longest / 1e3) if longest > 10.0 * LONGEST else ("cm", longest / 1e2)
-        return f"wheelbase = {longest:g} m is long: was it in {unit}? {longest:g} {unit} are {metres:g} m"
+        radius = np.sqrt(np.asarray(self.inertia) / np.asarray(self.mass)) / np.asarray(self.wheelbase)
+        is_usual = GYRATION[0] <= radius <= GYRATION[1]
+        values = ", ".join(f"{name} = {largest(getattr(self, name)):g}" for name in ("mass", "wheelbase", "inertia"))
+        return super().suspicion() or (None if is_usual else f"{values} do not fit{ODD}")
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
         if self.centre is not None:
             yield Bound(self.centre, "centre", at_most=self.wheelbase, why="the wheelbase")
             min_inertia = self.mass * self.centre**2
-            yield Bound(
-                self.inertia, "inertia", at_least=min_inertia, why="mass centre^2, as it is about the rear axle"
-            )
+            yield Bound(self.inertia, "inertia", at_least=min_inertia, why="mass centre^2, as about the rear axle")
 
 
 # The equations of motion.

@@ -15,18 +15,8 @@ from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, Spher
 from nonholonomic.geometry.surface import as_surface
 from nonholonomic.integration import AbstractProblem, Jumps
 from nonholonomic.parameters import as_one
-from nonholonomic.text import is_array, is_users, parted, shown, suspected_gravity
-from nonholonomic.validation import (
-    IN_DEGREES,
-    Bound,
-    Bounded,
-    Converted,
-    as_number,
-    is_traced,
-    largest,
-    require_all,
-    require_kind,
-)
+from nonholonomic.text import is_array, is_users, parted, shown
+from nonholonomic.validation import Bound, Bounded, Converted, Usual, as_number, is_traced, require_all, require_kind
 
 from ..friction import AbstractFriction, Frictionless, as_law
 from .dynamics import Dynamics, State, Stroller
@@ -43,8 +33,11 @@ def as_numbers(value: Any) -> Any:
         return value
 
 
-#: Largest usual angles [rad]: a front wheel that turns by half a turn, and a heading after two turns.
+#: Largest usual angles [rad] of a recording: a front wheel that turns by half a turn, and a heading after two turns.
 USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
+
+#: Angles, which may have been given in degrees, and are beyond a turn.
+STEERING, HEADING = {"usual": Usual(math.pi, turns=1)}, {"usual": Usual(2.0 * math.pi, turns=1)}
 
 
 def as_place(value: Any, name: str = "place", counts: tuple = (2, 3), single: bool = False) -> tuple[Converted, ...]:
@@ -57,27 +50,13 @@ def as_place(value: Any, name: str = "place", counts: tuple = (2, 3), single: bo
     return numbers
 
 
-class Angled(Bounded):
-    """A module whose angles may have been given in degrees."""
+GRAVITY = Bound.GRAVITY | Bound.NOT_NEGATIVE
 
-    def suspicion(self) -> str | None:
-        """The suspicion that an angle, of those that have usual values, is in degrees; `None` if none is. Raises `ValueError`
-        for an angle beyond a turn."""
-        for name, limit in USUAL.items():
-            magnitude = largest(getattr(self, name, None))
-            degrees = IN_DEGREES.format(f"{magnitude:g}")
-            if magnitude > 2.0 * math.pi:
-                raise ValueError(f"{name} = {shown(getattr(self, name))} must be within [-2 pi, 2 pi]{degrees}")
-            if magnitude > limit:
-                return f"{name} = {magnitude:g} rad is large{degrees}"
-        return None
+#: Speeds above 60 m/s suggest kilometres per hour.
+SPEED = {"usual": Usual(60.0, {"km/h": 1.0 / 3.6})}
 
 
-#: Speeds above this [m/s] suggest kilometres per hour.
-FASTEST = 60.0
-
-
-class Launch(Angled):
+class Launch(Bounded):
     """A launch: position of the rear axle, heading, speed and steering.
 
     **Arguments:**
@@ -110,16 +89,10 @@ class Launch(Angled):
     units |= {"steering_rate": "rad s-1"}
 
     place: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_place)
-    heading: Float[Array, "..."] = eqx.field(converter=as_number)
-    speed: Float[Array, "..."] = eqx.field(converter=as_number)
-    steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    heading: Float[Array, "..."] = eqx.field(converter=as_number, metadata=HEADING)
+    speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=SPEED)
+    steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=STEERING)
     steering_rate: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
-
-    def suspicion(self) -> str | None:
-        fastest = largest(self.speed)
-        if fastest > FASTEST:
-            return f"speed = {fastest:g} m/s is fast: was it in km/h? {fastest:g} km/h are {fastest / 3.6:.4g} m/s"
-        return super().suspicion()
 
 
 # The scene: vehicle, ground, friction and gravity.
@@ -183,7 +156,7 @@ class Scene(Bounded):
     body: Stroller
     surface: AbstractSurface = eqx.field(converter=as_surface, default=Plane())
     friction: AbstractFriction = eqx.field(converter=as_law, default=Frictionless())
-    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=Bound.NOT_NEGATIVE)
+    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=GRAVITY)
     side: str | None = eqx.field(static=True, default=None)
     fork: str = eqx.field(static=True, default="relative")
     heading: str = eqx.field(static=True, default="intrinsic")
@@ -198,7 +171,7 @@ class Scene(Bounded):
         self.surface.sign(self.side, DRIVES)
         if not isinstance(self.surface, Plane) and self.body.centre is not None:
             raise ValueError(
-                f"centre = {shown(self.body.centre)} must be 0.0 on a curved surface, where it is not exact"
+                f"centre = {shown(self.body.centre)} must be 0.0 on curved surfaces, where it is not exact"
             )
         if self.heading == "projected" and not isinstance(self.surface, Plane | AbstractQuadric):
             raise ValueError(f"heading = 'projected' must be 'intrinsic' on a {type(self.surface).__name__}")
@@ -213,9 +186,6 @@ class Scene(Bounded):
             yield Bound(jnp.maximum(*surface.semi_axes), "greater semi-axis of the surface", at_least=half, why=why)
         elif isinstance(surface, Torus):
             yield Bound(surface.ring + surface.tube, "surface ring + tube", at_least=half, why=why)
-
-    def suspicion(self) -> str | None:
-        return suspected_gravity(largest(self.gravity))
 
     @property
     def dynamics(self) -> Dynamics:

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from nonholonomic.geometry import Plane
 from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit, shown
-from nonholonomic.validation import require_file, require_flag, require_kind, require_package, require_whole
+from nonholonomic.validation import explaining, require_file, require_flag, require_kind, require_package, require_whole
 from nonholonomic.views import DARK, Body, Mesh, Page, Stage, bar, page
 from nonholonomic.views.plot import new_figure
 from nonholonomic.views.stage import curves_in, fixed, of_grid, own
@@ -276,6 +276,7 @@ PATIENCE = 1
 MINIMISED = ("effort", "time")
 
 
+@explaining
 def plan(
     scene: Scene,
     launch: Launch,
@@ -343,14 +344,14 @@ def plan(
     require_flag(progress, "progress")
     if planner is not None:
         require_kind(planner, "planner", Planner, ", as stroller.learn_planner returns it")
-    in_haste = minimise == "time"
-    problem = checked_problem(
-        scene, launch, goal, t1, obstacles, limits, footprint, tolerance=tolerance, in_haste=in_haste
-    )
-    if in_haste and not problem.limits.ranges().keys() - {"steering"}:
-        raise ValueError("minimise = 'time' needs a limit of speed, force, torque or grip, such as Limits(speed=1.0)")
     attempts, tried, reasons = [], [], []
     with status_line("planning", progress):
+        in_haste = minimise == "time"
+        problem = checked_problem(
+            scene, launch, goal, t1, obstacles, limits, footprint, tolerance=tolerance, in_haste=in_haste
+        )
+        if in_haste and not problem.limits.ranges().keys() - {"steering"}:
+            raise ValueError("minimise = 'time' needs a limit of speed, force, torque or grip, as in Limits(speed=1.0)")
         guesses = _guesses(problem, starts, planner, seed, reasons)
         for attempt in _attempts(problem, guesses, tolerance, tried):
             attempts.append(attempt)
@@ -428,6 +429,7 @@ REACH, CATCHING_UP = 2.0, 0.8
 SLOW = 0.1
 
 
+@explaining
 def track(scene: Scene, plan: Plan) -> Tracker:
     """Feedback that keeps a ride on its plan under disturbances.
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, Key
 from nonholonomic.geometry import Plane, dot
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.text import likely, shown
-from nonholonomic.validation import require, require_flag, require_kind, require_package, require_whole
+from nonholonomic.validation import explaining, require, require_flag, require_kind, require_package, require_whole
 
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import Scene
@@ -220,6 +220,7 @@ TASK_PARTS = ("launch", "goal", "t1", "obstacles", "limits", "footprint")
 NEEDED = ("launch", "goal", "t1")
 
 
+@explaining
 def learn_planner(
     scene: Scene,
     problems: Callable[[np.random.Generator], dict[str, Any]],

@@ -16,6 +16,7 @@ from nonholonomic.text import shown
 from nonholonomic.validation import (
     Bound,
     Bounded,
+    Usual,
     as_number,
     is_traced,
     largest,
@@ -23,10 +24,11 @@ from nonholonomic.validation import (
     require_all,
     require_kind,
     require_scalars,
+    warn,
 )
 
 from ..model.dynamics import Dynamics, padded
-from ..model.scene import Angled, Launch, Scene, as_numbers, as_place
+from ..model.scene import HEADING, STEERING, Launch, Scene, as_numbers, as_place
 
 #: Numbers, points (..., points, 2), and points of the ground, seen from above or in space, in NumPy or in JAX.
 Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
@@ -95,7 +97,7 @@ class Box(Bounded):
 
     centre: tuple[Float[Array, ""], ...] = eqx.field(converter=as_centre)
     size: tuple[Float[Array, ""], ...] = eqx.field(converter=as_size, metadata=Bound.POSITIVE)
-    angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+    angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.0, metadata=HEADING)
 
     @property
     def corners(self) -> Float[np.ndarray, "4 2"]:
@@ -323,7 +325,7 @@ UNLIMITED = 1e9
 MOST_STEERING = 1.2
 
 
-class Goal(Angled):
+class Goal(Bounded):
     """Where a plan ends, and how fast.
 
     **Arguments:**
@@ -348,7 +350,7 @@ class Goal(Angled):
     units: ClassVar[dict[str, str]] = {"place": "m or rad", "heading": "rad", "speed": "m s-1", "within": "1"}
 
     place: tuple[Float[Array, ""], ...] = eqx.field(converter=as_place)
-    heading: Float[Array, ""] | None = eqx.field(converter=as_number, default=None)
+    heading: Float[Array, ""] | None = eqx.field(converter=as_number, default=None, metadata=HEADING)
     speed: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     within: Float[Array, ""] = eqx.field(converter=as_number, default=0.05, metadata=Bound.POSITIVE)
 
@@ -362,7 +364,11 @@ def as_range(value: Any) -> Any:
     return (-bound, bound) if isinstance(bound, Array) and (is_traced(bound) or bound > 0.0) else value
 
 
-class Limits(Angled):
+#: A grip above 5 suggests per cent.
+GRIP = {"usual": Usual(5.0, {"%": 0.01})}
+
+
+class Limits(Bounded):
     """The ranges that a plan must not leave, each a pair (low, high) or one number b for (-b, b); `None` for no limit.
     A plan may exceed a limit by 0.001 of its range, so that a limit can be the very value at the start or at the goal, as
     in `speed=(0.0, 0.8)` for a plan that never reverses.
@@ -389,11 +395,11 @@ class Limits(Angled):
 
     units: ClassVar[dict[str, str]] = {"steering": "rad", "speed": "m s-1", "force": "N", "torque": "N m", "grip": "1"}
 
-    steering: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None)
+    steering: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None, metadata=STEERING)
     speed: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None)
     force: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None)
     torque: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None)
-    grip: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None)
+    grip: tuple[Float[Array, ""], ...] | None = eqx.field(converter=as_range, default=None, metadata=GRIP)
 
     def bounds(self) -> Iterator[Bound]:
         pairs = {name: getattr(self, name) for name in self.units if getattr(self, name) is not None}
@@ -431,6 +437,9 @@ RESERVE = 0.04
 
 #: The greatest distance of a goal [wheelbases]: the splines of a plan cannot end a longer drive exactly.
 FARTHEST = 1e5
+
+#: A mean speed [m/s] above which the place of a goal is suspected to be in another unit.
+FASTEST = 50.0
 
 #: Headings at which a goal without a heading is examined.
 HEADINGS = 72
@@ -560,9 +569,7 @@ class Problem(eqx.Module):
 
     def frame(self, place: tuple[ArrayLike, ...], angle: ArrayLike) -> Float[np.ndarray, "4 3"]:
         """The frame at a place, whose first axis has the direction of a heading [rad]."""
-        place, heading, left = frame_of(
-            self.scene.dynamics, pose_of(self.scene, place, jnp.asarray(angle, dtype=float))
-        )
+        place, heading, left = frame_of(self.scene.dynamics, pose_of(self.scene, place, jnp.asarray(angle, float)))
         return np.array([place, heading, left, cross(heading, left)], dtype=float)
 
     @property
@@ -714,9 +721,12 @@ def checked_problem(
     if not np.all(np.isfinite(problem.goal_pose)):
         raise ValueError(f"goal: place = {goal.place} must be on the ground, where it has no finite position")
     if problem.distance > FARTHEST * float(scene.body.wheelbase):
-        away = f"it is {problem.distance:.3g} m from the launch, more than {FARTHEST:.0f} wheelbases"
-        raise ValueError(
-            f"goal: place = {shown(goal.place)} is too far: {away}; plan a long way in stages, goal by goal"
+        away = f"it is {problem.distance:.4g} m from the launch, more than {FARTHEST:.0f} wheelbases"
+        raise ValueError(f"goal: place = {shown(goal.place)} is too far: {away}; plan a long way goal by goal")
+    if not in_haste and (speed := problem.distance / duration) > FASTEST:
+        warn(
+            f"goal: place = {shown(goal.place)} is {problem.distance:.3g} m from the launch, a mean speed of {speed:.3g} m/s: "
+            "was it in cm or mm? Or take a longer t1"
         )
     for number, (part, frame) in enumerate(problem.standing):
         if frame is ABOVE:

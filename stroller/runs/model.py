@@ -29,7 +29,7 @@ from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Table, Variable
 from nonholonomic.terminal import status_line
 from nonholonomic.text import name_of, shown
-from nonholonomic.validation import all_bounds, legal, require_kind, require_outside, require_scalars
+from nonholonomic.validation import all_bounds, explaining, legal, require_kind, require_outside, require_scalars
 
 from ..friction import Damping, RollingResistance
 from ..model.dynamics import Stroller
@@ -251,6 +251,7 @@ FORM = TableForm(
 )
 
 
+@explaining
 @status_line("simulating")
 def simulate(
     scene: Scene,
@@ -308,6 +309,7 @@ def simulate(
     return ride(model, t1, times, tolerance, solver, adjoint, max_steps)
 
 
+@explaining
 def sweep(
     scene: Scene,
     launch: Launch,
@@ -380,6 +382,7 @@ def sweep(
 EXPECTED = "a Recording or a nonholonomic.EventTimes"
 
 
+@explaining
 def identify(
     scene: Scene,
     data: Data | Sequence[Data],
@@ -429,6 +432,7 @@ def identify(
     return fit_runs(scene, data, free, EXPECTED, tolerance, search)
 
 
+@explaining
 def log_density(
     scene: Scene,
     data: Data | Sequence[Data],
@@ -522,6 +526,7 @@ class Recording(identification.AbstractRecording):
         require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")
 
 
+@explaining
 def read_recording(
     path: str | PathLike[str],
     columns: Mapping[str, object] | None = None,

@@ -585,7 +585,7 @@ def even_steps(
     for name, number in {"t1": t1, "times": times, "step_length": max_duration}.items():
         if validation.is_traced(number):
             raise ValueError(
-                f"{name} is traced and must be known for ImplicitMidpoint, whose steps have a given length"
+                f"{name} is traced and must be known for ImplicitMidpoint, whose steps have a fixed length"
             )
     knots = np.union1d(np.asarray(times), [0.0, float(t1)])
     counts = np.ceil(np.diff(knots) / float(max_duration) * (1.0 - 1e-12)).astype(int)

@@ -19,6 +19,7 @@ from nonholonomic.runs.model import Sliders
 from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, page_of, runs_at_ends, sliders_of
 from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit
+from nonholonomic.validation import explaining
 from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
 
 from ..model.dynamics import State
@@ -212,6 +213,7 @@ def vehicle(length: float, colour: int) -> tuple[views.Mesh, ...]:
 # A page with sliders that simulates a ride in the browser.
 
 
+@explaining
 @status_line("writing a page")
 def explore(
     scene: Scene,

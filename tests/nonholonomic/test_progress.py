@@ -82,6 +82,21 @@ def test_nothing_is_written_where_nobody_watches_or_wants_it(way, monkeypatch):
     assert slow_sweep(monkeypatch, stream, cells=3, waits=(0.2, 0.2), **options) == []
 
 
+def test_where_nobody_watches_the_first_slow_call_writes_one_line(monkeypatch):
+    watched(monkeypatch)
+    pipe = Pipe()
+    monkeypatch.setattr(sys, "stderr", pipe)
+    monkeypatch.setattr(progress_module, "PATIENCE", 0.2)
+    monkeypatch.setattr(Progress, "_has_told", False)
+    with status_line("planning"):
+        time.sleep(0.1)
+    assert pipe.lines == []
+    for _ in range(2):
+        with status_line("planning"), status_line("simulating"):
+            time.sleep(0.5)
+    assert [text for _, text in pipe.lines] == ["nonholonomic: planning (NONHOLONOMIC_PROGRESS=0 hides this line)"]
+
+
 def test_what_is_told_is_whether_a_program_is_being_made(monkeypatch):
     terminal = watched(monkeypatch)
 

@@ -63,7 +63,7 @@ BAD = [
     (lambda: Scene(BODY, fork=1), r"fork = 1 must be one of 'relative', 'absolute'"),
     (lambda: Scene(BODY, heading="north"), r"heading = 'north' must be one of 'intrinsic', 'projected'"),
     (lambda: Scene(BODY, side="inside"), r"side = 'inside' must be 'outside' on a Plane"),
-    (lambda: Scene(Stroller(1.7, 0.7, 0.9, 0.05, centre=0.3), Sphere(1.0)), r"centre = 0\.3 must be 0\.0 on a curved"),
+    (lambda: Scene(Stroller(1.7, 0.7, 0.9, 0.05, centre=0.3), Sphere(1.0)), r"centre = 0\.3 must be 0\.0 on curved"),
     (lambda: stroller.simulate(BODY, LAUNCH, 1.0), r"scene = .* must be a Scene"),
     (lambda: stroller.simulate(FULL, 1.0, 1.0), r"launch = 1\.0 must be a Launch"),
     (lambda: stroller.simulate(FULL, LAUNCH, 0.0), r"t1 = 0\.0 must be greater than 0\.0"),

@@ -141,7 +141,7 @@ HEADERS = "t,tilt,x\n0.0,5,1\n0.1,6,2\n"
             "t,tilt\n0,1,5\n",
             TIMED,
             None,
-            "line 2 has 3 cells, not 2; to read decimal commas, separate the columns by semic",
+            "line 2 has 3 cells, not 2; to read decimal commas, separate columns by semic",
         ),
         (
             "t,tilt\n0,1\n",
@@ -259,9 +259,7 @@ def test_a_class_has_files_of_its_own(tmp_path, name, encoding):
 def test_angles_in_degrees_are_suspected():
     """An inclination of more than pi is refused, a large direction is suspected only: it may count turns."""
     launch, times = tippe.Launch(0.1, 100.0), [0.0, 0.1]
-    with pytest.warns(
-        UserWarning, match=r"azimuth = 170 rad is large; recorded angles are in radians: did you mean np"
-    ):
+    with pytest.warns(UserWarning, match=r"azimuth = 170 rad is large; recordings are in radians: did you mean np"):
         tippe.Recording(launch, times, [[0.1, 20.0], [0.1, -170.0]], 0.01, ("theta", "azimuth"))
     ride = stroller.Launch((0.0, 0.0), 0.0, 1.0)
     with pytest.warns(UserWarning, match="steering = 25 rad is large"):
@@ -271,12 +269,25 @@ def test_angles_in_degrees_are_suspected():
 def test_a_file_without_some_times_or_with_radians_called_degrees_is_asked_about(tmp_path):
     launch = tippe.Launch(0.1, 100.0)
     (tmp_path / "film.csv").write_text("time [s],theta [deg]\n0.1,5.7\n,6.1\n0.3,\n,\n0.5,6.3\n,6.4\n")
-    with pytest.warns(UserWarning, match="2 lines without a time left out, the first is line 3"):
+    with pytest.warns(UserWarning, match="2 lines without a time left out, first in line 3"):
         film = tippe.read_recording(tmp_path / "film.csv", launch=launch)
     np.testing.assert_allclose(film.times, [0.1, 0.5])
     (tmp_path / "film.csv").write_text("time [s],theta [deg]\n0.1,0.1\n0.2,2.9\n")
     with pytest.warns(UserWarning, match="theta is at most 2.9 deg in .*: is this column in rad?"):
         tippe.read_recording(tmp_path / "film.csv", launch=launch)
+
+
+def test_a_recording_shows_the_units_of_its_file(tmp_path):
+    (tmp_path / "film.csv").write_text("time [ms],theta [deg],azimuth [deg]\n100,5,90\n200,6.5,100\n")
+    columns = {"time": "time", "theta": "theta"}
+    film = tippe.read_recording(
+        tmp_path / "film.csv", columns, error={"theta": (0.5, "deg")}, launch=tippe.Launch.degrees(5.0, 1500.0)
+    )
+    assert "times=[100, 200] ms, value=[5, 6.5] deg, error=[0.5, 0.5] deg, quantity='theta', t0=0 ms" in repr(film)
+    assert film.labels == ("theta(100 ms)", "theta(200 ms)")
+    assert "value=[0.1] rad, error=0.01 rad" in repr(tippe.Recording(tippe.Launch(0.1, 100.0), [0.1], [0.1], 0.01))
+    mixed = tippe.Recording(tippe.Launch(0.1, 100.0), [0.1], [[0.1, 0.2]], 0.01, ("theta", "x"))
+    assert "value=[0.1, 0.2], error=0.01," in repr(mixed)
 
 
 def test_times_in_milliseconds_are_suspected():

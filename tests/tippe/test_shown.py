@@ -147,6 +147,11 @@ def test_a_run_tells_whether_the_top_turned_over(run):
     assert "not turned over: without friction no top turns over" in str(sliding)
 
 
+def test_a_top_that_fell_back_is_not_called_inverted(run, monkeypatch):
+    monkeypatch.setattr(tippe.Trajectory, "inversion_time", 0.4)
+    assert "turned over at 0.4 s, upright again at the end\n" in str(run)
+
+
 def test_one_time_is_a_time(run):
     assert_close(run.at(0.5).theta, run.at([0.5]).theta)
     assert run.at(0.5).position.shape == (1, 3)
@@ -273,7 +278,7 @@ def test_plots_that_cannot_be_drawn_are_refused(run):
         ((), {"ax": object()}, "ax takes one quantity: name it"),
         ((run,), {}, r"others = a run must be a list of runs: write others=\[run\]"),
         (("theta",), {"label": ["a", "b"]}, r"label = \['a', 'b'\] must have 1 texts"),
-        (("theta", 3.0), {}, r"quantity = 3\.0 must be the name of a quantity, such as 'theta'"),
+        (("theta", 3.0), {}, r"quantity = 3\.0 must name a quantity, such as 'theta'"),
     ):
         with pytest.raises(ValueError, match=message):
             run.plot(*arguments, **options)

@@ -204,7 +204,7 @@ INERTIAS = {"": 1.0, "in kg cm^2": 1e-4, "in kg mm^2": 1e-6, "in g cm^2": 1e-7, 
 #: Least density of the material of a turned top that is not suspicious [kg/m^3].
 LEAST_DENSITY = 50.0
 #: Mean densities [kg/m^3]: below that of a table-tennis ball, and above that of osmium.
-LEAST_MEAN, GREATEST_DENSITY = 80.0, 23_000.0
+LEAST_MEAN, GREATEST_DENSITY, BRASS = 80.0, 23_000.0, 9000.0
 #: The radius [m] above which another unit is suspected, the greatest that it may have in that unit, and the plausible
 #: range of I1 / (m R^2).
 GREATEST_RADIUS, GREATEST_TOY = 1.0, 0.1
@@ -411,6 +411,8 @@ class Top(AbstractBody):
         is_legal = fits(1.0, 1.0, 1.0, 0.0, GREATEST_RADIUS)
         if is_legal and np.all(density >= LEAST_MEAN):
             return None
+        if np.all((mass >= LEAST_MEAN) & (mass < GREATEST_DENSITY) & (1e-3 * density > BRASS)):
+            return f"mass = {np.max(mass):g} kg is unusual for a top: was it a density? Top.turned takes density"
         # Moments of inertia in no unit were computed from the mass and the lengths.
         options = itertools.product(MASSES, ["the diameter"] if is_legal else LENGTHS, (None, *INERTIAS))
         for in_mass, in_length, in_inertia in sorted(options, key=lambda units: sum(map(bool, units))):
@@ -425,9 +427,7 @@ class Top(AbstractBody):
                     for name in values
                     if asked[name]
                 ]
-                right = [
-                    f"{name}={np.max(values[name]) * factors[name]:.4g}" for name in values if factors[name] != 1.0
-                ]
+                right = [f"{name}={np.max(values[name]) * factors[name]:.4g}" for name in values if factors[name] != 1]
                 words = "is unusual for a top: was it" if len(odd) == 1 else "are unusual for a top: were they"
                 units = " and ".join(dict.fromkeys(filter(None, asked.values())))
                 return f"{', '.join(odd)} {words} {units}? Then {', '.join(right)}"

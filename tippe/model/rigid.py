@@ -91,9 +91,7 @@ class Inertia(Bounded):
             return matrix
         values = as_number(matrix)
         if not eqx.is_array(values) or values.shape != (3, 3):
-            raise ValueError(
-                f"inertia = {shown(matrix)} must be a matrix of shape (3, 3), in kg m^2 about the centre of mass"
-            )
+            raise ValueError(f"inertia = {shown(matrix)} must be a (3, 3) matrix, in kg m^2 about the centre of mass")
         if not is_traced(values):
             asymmetry = np.abs(np.asarray(values) - np.asarray(values).T)
             if np.any(asymmetry > 1e-12 * np.max(np.abs(values))):

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import AbstractSurface, Component, Cylinder, Plane, Sphere, Torus, Vector
@@ -16,8 +17,8 @@ from nonholonomic.geometry.surface import as_surface
 from nonholonomic.geometry.vector import cross, dot, none_if_zero, scale, sum_vectors
 from nonholonomic.integration import Components, States
 from nonholonomic.parameters import as_one, numbers
-from nonholonomic.text import Stated, likely_fix, shown, suspected_gravity
-from nonholonomic.validation import Bound, Bounded, as_number, explaining, largest, require, require_all, require_kind
+from nonholonomic.text import Stated, likely_fix, shown
+from nonholonomic.validation import Bound, Bounded, Usual, as_number, explaining, largest, require, require_kind, warn
 
 from ..friction import A_LAW, AbstractFriction, Frictionless, NoSlip, SetValuedCoulomb, as_law
 from .body import AbstractBody, Top
@@ -25,19 +26,26 @@ from .dynamics import TURNING, Dynamics, RollingDynamics, from_frame, inclinatio
 from .rigid import AbstractRigidBody, RigidRolling, RigidSlipping, several
 from .stick_slip import StickSlip
 
-#: Spins above this [rad/s] suggest revolutions per minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
-FASTEST = 1000.0
+#: Spins [rad/s], speeds [m/s] and azimuths [rad] above which another unit is suspected: by hand a top gets 100 to 300 rad/s,
+#: 1000 to 3000 rpm.
+SPIN = {"usual": Usual(1000.0, {"rpm": math.pi / 30.0})}
+SPEED = {"usual": Usual(20.0, {"cm/s": 0.01, "mm/s": 1e-3})}
+AZIMUTH = {"usual": Usual(4.0 * math.pi)}
 
 #: Ranges of angles of a launch.
 INCLINATION = {"range": {"at_least": 0.0, "at_most": math.pi, "unit": "rad"}}
 HALF_TURN = {"range": {"at_least": -math.pi, "at_most": math.pi, "unit": "rad"}}
 
-#: What to do where the spin is missing, or in another unit.
+#: What to do where the spin is missing, or in another unit, and where a launch has a height.
 SPINS = "Launch takes spin in rad/s, Launch.degrees takes rpm: 20 turns a second are spin=125.7 or rpm=1200"
+HEIGHT = "a launch touches the arena; place= states where"
+
+#: Angles [deg] below this, closer to upright than a hand can launch a top, suggest radians.
+LEAST_DEGREES = 0.5
 
 
 #: Units of the texts and pictures of `Launch.degrees`. Where a picture has no angle, it has a time.
-IN_DEGREES = ("deg", "rpm", "s")
+DEGREES = ("deg", "rpm", "s")
 
 
 class Launch(Stated, Bounded):
@@ -79,17 +87,20 @@ class Launch(Stated, Bounded):
 
     units: ClassVar[dict[str, str]] = {"theta": "rad", "spin": "rad s-1", "eta": "rad", "azimuth": "rad"}
     units |= {"place": "m or rad", "velocity": "m s-1", "angular_velocity": "rad s-1"}
-    advice: ClassVar[dict[str, str]] = dict.fromkeys(("spin", "rpm"), SPINS)
+    advice: ClassVar[dict[str, str]] = dict.fromkeys(("spin", "rpm", "omega"), SPINS) | {"height": HEIGHT}
 
     theta: Float[Array, "..."] = eqx.field(converter=as_number, metadata=INCLINATION)
-    spin: Float[Array, "..."] = eqx.field(converter=as_number)
+    spin: Float[Array, "..."] = eqx.field(converter=as_number, metadata=SPIN)
     eta: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=HALF_TURN)
-    azimuth: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    azimuth: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0, metadata=AZIMUTH)
     place: tuple[Float[Array, "..."], ...] | None = eqx.field(
         converter=several("place", (2, 3), "(x, y), (mu, eta) or (x, y, z)", True), default=None, kw_only=True
     )
     velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(
-        converter=several("velocity", (2,), "two numbers, along t1 and t2", True), default=None, kw_only=True
+        converter=several("velocity", (2,), "two numbers, along t1 and t2", True),
+        default=None,
+        kw_only=True,
+        metadata=SPEED,
     )
     angular_velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(
         converter=several("angular_velocity", (3,), "three numbers, along t1, t2 and n", True),
@@ -129,17 +140,18 @@ class Launch(Stated, Bounded):
         require(eta, "eta", at_least=-180.0, at_most=180.0, why="in degrees")
         require(azimuth, "azimuth", why="in degrees")
         require(rpm, "rpm")
+        if 0.0 < (inclination := largest(as_number(theta))) < LEAST_DEGREES:
+            warn(
+                f"theta = {inclination:g} deg is closer to upright than a hand can launch a top: was it in radians? "
+                f"{inclination:g} rad are {math.degrees(inclination):.3g} deg"
+            )
         theta, eta, azimuth = (jnp.radians(as_number(angle)) for angle in (theta, eta, azimuth))
-        return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others).stated_in(IN_DEGREES)
+        return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others).stated_in(DEGREES)
 
     def suspicion(self) -> str | None:
-        fastest = largest(self.spin)
-        if fastest <= FASTEST:
-            return None
-        return (
-            f"spin = {fastest:g} rad/s is {fastest * 30.0 / math.pi:.3g} revolutions a minute, fast for a top: was it in rpm? "
-            f"{fastest:g} rpm are {fastest * math.pi / 30.0:.4g} rad/s"
-        )
+        # People write whole degrees; radians are rarely whole numbers.
+        is_whole = largest(self.theta) >= 1.0 and largest(self.spin) > 0.0 and not np.any(np.asarray(self.theta) % 1.0)
+        return Usual(0.0).question("theta", self.theta, "rad") if is_whole else super().suspicion()
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
@@ -214,7 +226,7 @@ class Scene(Bounded, Generic[Body]):
     body: Body
     surface: AbstractSurface = eqx.field(converter=as_surface, default=Plane())
     friction: AbstractFriction = eqx.field(converter=as_law, default=Frictionless())
-    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=Bound.POSITIVE)
+    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81, metadata=Bound.GRAVITY)
     contact: str = eqx.field(static=True, default="stop")
     restitution: Float[Array, "..."] | None = eqx.field(
         converter=none_if_zero, default=None, metadata={"range": {"at_least": 0.0, "at_most": 1.0}}
@@ -285,7 +297,7 @@ class Scene(Bounded, Generic[Body]):
             if unit == "m" and (size := largest(value)) > LARGEST_ARENA:
                 unit = "mm" if size > 10.0 * LARGEST_ARENA else "cm"
                 return f"{name} = {size:g} m is larger than a room: was it in {unit}? There a top moves as on a Plane"
-        return suspected_gravity(largest(self.gravity))
+        return super().suspicion()
 
     @property
     def frame(self) -> AbstractFrame:
@@ -351,7 +363,8 @@ class Scene(Bounded, Generic[Body]):
 
     def check_start(self, launch: Launch) -> None:
         """Raise `ValueError` if a launch has no place on this arena."""
-        require_all(self.start_bounds(launch))
+        for bound in self.start_bounds(launch):
+            bound.require()
 
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
         """The ranges of a launch's numbers on this arena.

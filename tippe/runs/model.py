@@ -21,18 +21,27 @@ from nonholonomic.runs.event import EventFunction, with_event
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, Start, model_of, run_of, statuses
 from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Quantity, Variable
-from nonholonomic.validation import Bound, all_bounds, legal, require_kind, require_scalars
+from nonholonomic.validation import Bound, Function, all_bounds, explaining, legal, require_kind, require_scalars
 
 from ..friction import NoSlip
 from ..model.body import Top
 from ..model.dynamics import LOSSES, NO_COSINE
-from ..model.scene import Launch, Scene, generic_direction
+from ..model.scene import SPINS, Launch, Scene, generic_direction
 from ..modes.airborne import airborne_modes
 from ..modes.plane import hopping_modes
 from ..modes.problems import BEHIND_PATH, INVERTED, InversionProblem, StemContact, event_of, trajectory_problem
 from ..modes.sticking import above_the_ground, energy_in, loss, stick_slip_modes
 from .observables import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, AbstractTrajectory, allowance, quantities_of
 from .trajectory import HybridTrajectory, Trajectory, simulate_launch
+
+#: What to do about a number of a launch that a function does not take.
+IN_A_LAUNCH = "a launch has it: launch=tippe.Launch(theta, spin), or launch=tippe.Launch.degrees(theta, rpm)"
+
+
+def of_launches(function: Function) -> Function:
+    """Let a function of launches name its arguments where it is called with others, and say how a launch is made."""
+    names = ("theta", "spin", "eta", "azimuth", "degrees")
+    return explaining(function, {name: IN_A_LAUNCH for name in names} | {"rpm": SPINS, "omega": SPINS})
 
 
 def modes_of(
@@ -247,7 +256,7 @@ class TopModel(AbstractSceneModel):
             )
         if nested and not self.smooth:
             raise ValueError(
-                "second derivatives are not available through changes of mode: contact = 'hybrid', SetValuedCoulomb"
+                "second derivatives do not exist through changes of mode: contact = 'hybrid', SetValuedCoulomb"
             )
 
     @property

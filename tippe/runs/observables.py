@@ -1,6 +1,7 @@
 """The quantities of a run of a tippe top, in contact or through flights: one state at each time."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self, TypeAlias, TypeVar
 
@@ -369,7 +370,9 @@ class AbstractTrajectory(AbstractRun):
             f"  theta: {factor * float(self.theta[0]):.6g} to {factor * float(self.theta[-1]):.6g} {angle}",
         ]
         if self.dense is not None and isinstance(self.scene.body, AbstractBody):
-            lines.append(f"  {self._whether_it_turned_over}")
+            words = self._whether_it_turned_over
+            is_upright = words.startswith("turned") and np.asarray(self.theta)[-1] < math.pi / 2.0
+            lines.append(f"  {words}{', upright again at the end' if is_upright else ''}")
         if word == "contact_lost" and self.scene.contact == "stop" and isinstance(self.scene.body, Top):
             lines.append("  to continue through the flight, use a Scene with contact='hybrid'")
         if "axis_drift" in self.stats:
@@ -411,13 +414,8 @@ def audited(run: Run, path: DenseSolution | HybridPath, tolerance: Number, **mor
     status is "unresolved" if its energy has grown or does not balance the work of friction and impacts."""
     energy, work = np.asarray(run.energy), np.asarray(run.work)
     residual = float(np.max(np.abs(energy - energy[0] - work)))
-    axis_drift = float(np.max(np.abs(np.linalg.norm(np.asarray(run.states)[2:5], axis=0) - 1.0)))
-    stats = {
-        "accepted": path.accepted,
-        "rejected": path.rejected,
-        "axis_drift": axis_drift,
-        "energy_residual": residual,
-    }
+    drift = float(np.max(np.abs(np.linalg.norm(np.asarray(run.states)[2:5], axis=0) - 1.0)))
+    stats = {"accepted": path.accepted, "rejected": path.rejected, "axis_drift": drift, "energy_residual": residual}
     limit = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
     balanced = residual <= limit and energy[-1] <= energy[0] + limit
     status = run.status if balanced or run.status == Status.FAILED.word else Status.UNRESOLVED.word

@@ -314,9 +314,7 @@ class HybridTrajectory(AbstractTrajectory):
         if len(self.hops) >= MOST_BOUNCES or contacts >= MOST_ROUNDS:
             return "there were too many flights or changes of contact"
         if self.scene.flies_in_closed_form:
-            return (
-                "sphere and stem touch the plane together, and friction is so strong that the forces are not determined"
-            )
+            return "sphere and stem touch the plane together, with so much friction that the forces are undetermined"
         body, distance = self.scene.body, self.resampled(np.array([self.end_time])).distance[0, 0]
         if body.stem is not None and abs(distance) < NEAR * body.radius:
             return (

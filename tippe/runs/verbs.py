@@ -34,17 +34,8 @@ from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_se
 from nonholonomic.runs.table import TableForm, TableJob
 from nonholonomic.sweeps import Axis, Table, axis
 from nonholonomic.terminal import status_line
-from nonholonomic.text import shown, unit_of
-from nonholonomic.validation import (
-    IN_DEGREES,
-    as_number,
-    is_traced,
-    require,
-    require_all,
-    require_kind,
-    require_outside,
-    warn,
-)
+from nonholonomic.text import in_unit, shown, unit_of
+from nonholonomic.validation import IN_DEGREES, as_number, is_traced, require, require_kind, require_outside, warn
 
 from ..friction import Frictionless
 from ..model.body import Top
@@ -52,7 +43,16 @@ from ..model.dynamics import inclination, parts
 from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
 from ..modes.problems import InversionProblem, StemContact, angle_of, event_of
-from .model import INVERSIONS, NUMBERS_OF_A_LAUNCH, REVERSALS, SEVERAL, TopModel, variable_numbers, why_unresolved
+from .model import (
+    INVERSIONS,
+    NUMBERS_OF_A_LAUNCH,
+    REVERSALS,
+    SEVERAL,
+    TopModel,
+    of_launches,
+    variable_numbers,
+    why_unresolved,
+)
 from .observables import QUANTITIES, quantities_of
 from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
@@ -60,6 +60,9 @@ from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
 #: The most turns a second by hand: greater spins are not taken for turns a second.
 MOST_TURNS = 50.0
+
+#: A horizon [s] above which milliseconds are suspected.
+LONGEST = 1000.0
 
 #: Advice in messages about lists, where a table is the better choice.
 LISTS = "inversion_table takes lists, and jax.vmap maps over them"
@@ -73,6 +76,8 @@ def check_run(scene: Any, launch: Any, t1: Number, tolerance: Number, lists: str
     """
     require_run(scene, launch, t1, tolerance, (Scene, Launch), lists)
     scene.check_start(launch)
+    if not is_traced(t1) and np.max(t1) > LONGEST:
+        warn(f"t1 = {np.max(t1):g} s is long for a top; times are in seconds: did you mean t1={np.max(t1) / 1e3:g}?")
 
 
 def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: object, angle: Any) -> None:
@@ -110,9 +115,16 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: obj
     if abs(I1 - I3) * R < I3 * a and start * R > a and fastest <= MOST_TURNS:
         precession = math.sqrt(mass * float(scene.gravity) * a / (I3 * (a / R - end) + I1 * end))
         slowest = R * (I1 * (1.0 - end**2) + I3 * (end - a / R) ** 2) * precession / (I3 * (R * start - a))
-        if fastest < slowest < 2.0 * math.pi * fastest:
-            advice = f"was it in turns a second? {fastest:.4g} turns a second are {2.0 * math.pi * fastest:.4g} rad/s"
-            warn(f"spin = {fastest:.4g} rad/s is slow: this top needs about {slowest:.3g} rad/s to turn over; {advice}")
+        unit, factor = in_unit("rad/s", unit_of(launch))
+        number, turns = factor * fastest, 2.0 * math.pi * factor
+        for other, size in {"rad/s": factor, "turns a second": turns}.items():
+            # Such a top would turn over if its spin were in the other unit.
+            if fastest < slowest < size * fastest:
+                warn(
+                    f"spin = {number:.4g} {unit} is slow: this top needs about {factor * slowest:.3g} {unit} to turn over; was "
+                    f"it in {other}? {number:.4g} {other} are {size * number:.4g} {unit}"
+                )
+                break
 
 
 def check_smooth(scene: Scene, caller: str) -> None:
@@ -121,9 +133,7 @@ def check_smooth(scene: Scene, caller: str) -> None:
         raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table supports flights")
     if scene.friction.set_valued:
         kind = type(scene.friction).__name__
-        raise ValueError(
-            f"friction = {kind} must be a law with a single mode for {caller}; inversion_table supports others"
-        )
+        raise ValueError(f"friction = {kind} must be a law with a single mode for {caller}; inversion_table has others")
 
 
 def require_rigid(scene: Scene) -> None:
@@ -232,6 +242,7 @@ def too_many_steps(t1: float, max_steps: int, end: float) -> str:
     ).replace("_", " ")
 
 
+@of_launches
 def inversion_table(
     scene: Scene,
     launch: Launch | None = None,
@@ -338,6 +349,7 @@ def inversion_table(
     require_outside(
         (scene, launch, theta, spin, eta, mu, azimuth, axes, t1, angle), "inversion_table", "inversion_time"
     )
+    require_kind(scene, "scene", Scene)
     check_event(angle, crossing, ("first", "last", "both"))
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {shown(method)} must be 'ensemble' or 'diffrax'")
@@ -350,6 +362,7 @@ def inversion_table(
     return event_table(scene, launch_values, axes, t1, event_of(scene, angle), options, crossing, method)
 
 
+@of_launches
 def reversal_table(
     scene: Scene,
     launch: Launch | None = None,
@@ -422,9 +435,7 @@ def event_table(
     model = TopModel.timed(**roots, angle=angle)
     names = full_sensitivities(model, options.sensitivities, crossing)
     if not model.smooth and method == "diffrax":
-        raise ValueError(
-            "method = 'diffrax' does not support runs of several modes: contact = 'hybrid' or SetValuedCoulomb"
-        )
+        raise ValueError("method = 'diffrax' has no runs of several modes: contact = 'hybrid' or SetValuedCoulomb")
     check_cells(model, grid, options)
     axis_values = {axis.number: axis.values for axis in grid}
     if angle is None:
@@ -463,6 +474,7 @@ def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
         warn(f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}")
 
 
+@of_launches
 def trajectory_table(
     scene: Scene,
     launch: Launch | None = None,
@@ -548,6 +560,7 @@ def trajectory_table(
 # The functions for single launches, on those of `nonholonomic.runs`.
 
 
+@of_launches
 @status_line("simulating")
 def simulate(
     scene: Scene,
@@ -601,6 +614,7 @@ def simulate(
     return simulate_launch(TopModel(scene=scene, launch=launch), t1, times, tolerance, solver, adjoint)
 
 
+@of_launches
 @status_line("simulating")
 def inversion_time(
     scene: Scene,
@@ -658,6 +672,7 @@ def inversion_time(
     return first_or_last_time(model, t1, crossing, settings_for_lanes(tolerance, solver))
 
 
+@of_launches
 @status_line("simulating")
 def reversal_time(
     scene: Scene,
@@ -724,6 +739,7 @@ def first_or_last_time(model: TopModel, t1: Number, crossing: str, settings: Set
     return time
 
 
+@of_launches
 @status_line("simulating")
 def lyapunov_exponent(
     scene: Scene, launch: Launch, t1: float, tolerance: float = 1e-9, solver: diffrax.AbstractERK | None = None
@@ -763,7 +779,8 @@ def lyapunov_exponent(
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
     require_outside((scene, launch, t1, tolerance), "lyapunov_exponent", "lists in the launch in place of vmap")
-    require_all(run_bounds(t1, tolerance))
+    for bound in run_bounds(t1, tolerance):
+        bound.require()
     settings = settings_for_lanes(tolerance, solver)
     shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}
     if len(shapes) > 1 or any(len(shape) > 1 for shape in shapes):
@@ -778,6 +795,7 @@ def lyapunov_exponent(
 LEAST_ANGLE = 1e-6
 
 
+@of_launches
 @status_line("simulating")
 def extended_inversion_time(
     scene: Scene,

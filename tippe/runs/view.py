@@ -32,7 +32,7 @@ from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
 from ..modes.plane import Slide
 from ..modes.problems import event_of
-from .model import TopModel
+from .model import TopModel, of_launches
 from .observables import OF_RIGID_BODIES, QUANTITIES, AbstractTrajectory, names_of
 from .verbs import check_reversible, check_run
 
@@ -220,6 +220,7 @@ REACH = 0.5
 REVERSED = {int(Status.INVERTED): "reversed", int(Status.NOT_INVERTED): "not_reversed"}
 
 
+@of_launches
 @status_line("writing a page")
 def explore(
     scene: Scene,

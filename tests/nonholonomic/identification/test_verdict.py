@@ -98,7 +98,7 @@ def test_a_number_that_does_not_act_is_seen_at_once():
     with pytest.warns(FitWarning) as caught:
         fit = fitted_with_limit(100.0, 1e-13)
     assert [str(warning.message) for warning in caught] == [
-        "no prediction depends on level, so the data say nothing about it: fix it, or add other data",
+        "no prediction depends on level, so the data say nothing about it: fix it, or add data",
         "the data do not determine level +0.001",
     ]
     assert len(fit.distribution.points) == 256

@@ -201,5 +201,5 @@ def test_the_start_of_a_hybrid_obeys_the_constraints_of_its_first_mode():
 
 
 def test_a_reset_without_a_margin_is_reported():
-    with pytest.warns(UserWarning, match=r"Broken\.reset is never called: write margin as well"):
+    with pytest.warns(UserWarning, match=r"Broken\.reset is never called: write margin too"):
         check_start(broken(Sleigh, reset=Bumper.reset), (np.zeros(3), np.zeros(3)))
