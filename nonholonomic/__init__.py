@@ -31,6 +31,8 @@ from .geometry import Torus as Torus
 from .identification import FitWarning as FitWarning
 from .identification import Free as Free
 from .integration.problem import Status as Status
+from .runs.branch import Branch as Branch
+from .runs.branch import SpecialPoint as SpecialPoint
 from .runs.crossings import crossings as crossings
 from .runs.event import event_time as event_time
 from .runs.identify import EventTimes as EventTimes

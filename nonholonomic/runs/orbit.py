@@ -26,6 +26,7 @@ from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESO
 from ..terminal import status_line
 from ..text import described, shown
 from ..validation import as_number, explaining, is_traced, require_outside
+from .branch import Branch, branch_of
 from .crossings import SAME, on_margin, section_of
 from .event import Ensemble, EventTime
 from .model import AbstractModel, AbstractSceneModel, check_run, model_of, require_event, settings_for_lanes
@@ -81,6 +82,8 @@ class Orbit(eqx.Module):
       shifted; the orbit is then one of a family near the guess.
     - `iterations`: number of Newton steps; `residual`: by how much the last return missed; `reason`: 0, or why there is no
       orbit, as an integer; the other numbers are then NaN or have no meaning.
+    - `names`: those of the components; `leaves`, `search`: the numbers and the form of the search, for `branch`; `returns`:
+      number of returns in a period.
 
     **Example:** as for `periodic_orbit`.
 
@@ -104,6 +107,9 @@ class Orbit(eqx.Module):
     iterations: Int[Array, "..."]
     reason: Int[Array, "..."]
     names: tuple[str, ...] = eqx.field(static=True)
+    leaves: tuple[Array, ...] = ()
+    search: Any = eqx.field(static=True, default=None)
+    returns: int = eqx.field(static=True, default=1)
 
     @property
     def stable(self) -> Bool[Array, "..."]:
@@ -123,14 +129,65 @@ class Orbit(eqx.Module):
         reason = int(self.reason)
         return "illegal" if reason == len(REASONS) - 1 else "unresolved" if reason else "completed"
 
+    def branch(
+        self, name: str, until: float, step: float | None = None, points: int = 500, period: Any = None
+    ) -> Branch:
+        """Follow the orbit while a number changes, by pseudo-arclength continuation; runs on the host.
+
+        The branch goes around folds, where the number turns back. Folds, period doublings, Neimark-Sacker points and branch
+        points are located to 1e-8 of the number. The branch ends at `until`, back at the first value of the number, or where
+        the orbit ceases to exist, such as where a reset grazes. One program is compiled for all points.
+
+        **Arguments:**
+
+        - `name`: the number, of the system or of its event, such as "mu" or "modes[0].mu"; a number of this name in all modes
+          changes in all of them.
+        - `until`: the last value of the number, on either side of the value at the orbit.
+        - `step`: largest change of the number between neighbouring points, by default a fiftieth of the range. Where the
+          state changes faster than the number, in units of its largest component, steps are shorter.
+        - `points`: the most points.
+        - `period`: if the number changes the period of a drive, the period [s] as a function of the number.
+
+        **Returns:** a `Branch`.
+
+        **Raises:** `ValueError` for an unknown number, arguments out of range, an orbit of a batch, and an orbit of a family;
+        pass `free` to `periodic_orbit`, so that the orbit is the only one for a fixed number. The same inside transformations.
+
+        **Example:** the limit cycle of van der Pol's oscillator up to mu = 2.
+
+        ```
+        >>> import jax.numpy as jnp
+        >>> import nonholonomic
+        >>> class Oscillator(nonholonomic.AbstractMode):
+        ...     mu: float
+        ...
+        ...     def field(self, t, y):
+        ...         return jnp.array([y[1], self.mu * (1.0 - y[0] ** 2) * y[1] - y[0]])
+        >>> def section(t, y):
+        ...     return y[1]
+        >>> orbit = nonholonomic.periodic_orbit(nonholonomic.Hybrid([Oscillator(1.0)]), [2.0, 0.0], section)
+        >>> branch = orbit.branch("mu", 2.0, step=0.25)
+        >>> print(f"{branch.periods[0]:.8f} s, {branch.periods[-1]:.8f} s")
+        6.66328686 s, 7.62987448 s
+        >>> print(branch)
+        branch of periodic orbits over mu, 7 points from 1 to 2
+          stable from 1 to 2
+          ended because the number reaches the end of the range
+
+        ```
+        """
+        return branch_of(self, name, until, step, points, period)
+
     def __repr__(self) -> str:
         if is_traced(self) or np.ndim(self.period):
             return f"Orbit(period={shown(self.period)}, state={shown(self.state)})"
         values = np.asarray(self.multipliers).tolist()
         multipliers = [f"{value.real:.8g}" + f"{value.imag:+.8g}j" * bool(value.imag) for value in values]
         pairs = zip(self.names, np.asarray(self.state).tolist(), strict=True)
+        in_returns = f" in {self.returns} returns" if self.returns > 1 else ""
+        stability = "stable" if self.stable else "unstable"
         lines = [
-            f"{'stable' if self.stable else 'unstable'} periodic orbit with a period of {float(self.period):.12g} s",
+            f"{stability} periodic orbit with a period of {float(self.period):.12g} s{in_returns}",
             ", ".join(f"{name} = {value:.12g}" for name, value in pairs),
             f"multipliers {', '.join(multipliers)}",
             f"error below {float(self.error):.1g}, Newton steps {int(self.iterations)}",
@@ -146,7 +203,7 @@ class Return(NamedTuple):
     - `time` [s], `state`: when and where, (cells,) and (components, cells); `rate`: of the state there.
     - `by_state`, `time_by_state`: derivatives by the start, (cells, components, components) and (cells, components);
       `by_numbers`, `time_by_numbers`: those by each other number, (cells, components) and (cells,).
-    - `in_motion`: whether it is not at a reset; `reason`: as for `Orbit`, where there is no return.
+    - `in_motion`: whether it is not at a reset; `reason`: as for `Orbit`, where there is no return; `resets`: their number.
     """
 
     time: Array
@@ -158,6 +215,7 @@ class Return(NamedTuple):
     time_by_numbers: list[Array]
     in_motion: Array
     reason: Array
+    resets: Array
 
 
 class Newton(NamedTuple):
@@ -319,7 +377,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
         reason = jnp.select([*faults, mode != ensemble.first], [6, missing, 8, 7, 2], 0)
         by_state, time_by_state = (jnp.stack(parts[:count], axis=-1) for parts in (changes, delays))
         time = ended.end_time if self.is_driven else ended.crossing_time
-        return Return(time, point, rate, by_state, time_by_state, changes[count:], delays[count:], in_motion, reason)
+        by_numbers = (changes[count:], delays[count:])
+        return Return(time, point, rate, by_state, time_by_state, *by_numbers, in_motion, reason, ended.counts[0])
 
     def _in_components(
         self, leaves: tuple[Array, ...], active: tuple[int, ...], point: Array, changes: list[Array], rate: Array
@@ -627,10 +686,12 @@ def periodic_orbit(
     places = tuple(k for k, name in enumerate(names) if free is None or name in free)
     options = (period is not None, places, symmetry is not None)
     settings = settings_for_lanes(tolerance, solver)
-    time, state, *parts = differentiable_solve(*OrbitSolve.of(model, as_number(horizon), settings, *options))
+    search, *leaves = OrbitSolve.of(model, as_number(horizon), settings, *options)
+    time, state, *parts = differentiable_solve(search, *leaves)
     real, imaginary, error, residual, *counts = parts
     family, iterations, reason = (jnp.asarray(count).astype(int) for count in counts)
-    orbit = Orbit(time, state, real + 1j * imaginary, error, residual, family, iterations, reason, names)
+    numbers, leaves = (time, state, real + 1j * imaginary, error, residual), tuple(map(jnp.asarray, leaves))
+    orbit = Orbit(*numbers, family, iterations, reason, names, leaves, search)
     if not is_traced(reason) and np.ndim(reason) == 0 and int(reason):
         hint = "" if period is None or model.smooth else "; a reset near the end of the period has such an effect"
         if free is not None:

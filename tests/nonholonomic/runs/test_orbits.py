@@ -115,10 +115,14 @@ def test_the_simplest_walker():
     assert orbit.error < 1e-9
     assert "stable periodic orbit with a period of 3.88246375285" in repr(orbit)
 
-    # A period doubling at the slope 0.0150884379.
-    for slope in (0.011, 0.013, 0.0150884379):
-        orbit = periodic_orbit(walker(slope), orbit.state, heel)
-    np.testing.assert_allclose(orbit.multipliers[0], -1.0, atol=1e-7)
+    # Steps of two lengths. The slope is one number of both modes.
+    branch = orbit.branch("slope", 0.0165, step=1e-3)
+    assert [point.kind for point in branch.special] == ["period doubling"]
+    np.testing.assert_allclose(branch.special[0].value, 0.0150884379, atol=2e-10)
+    limping = branch.switched()
+    assert limping.stable
+    np.testing.assert_allclose(limping.period, 2.0 * branch.special[0].orbit.period, rtol=1e-3)
+    assert "in 2 returns" in repr(limping)
 
 
 class Driven(AbstractMode):

@@ -1,0 +1,364 @@
+"""Pseudo-arclength continuation of periodic orbits: that of a fixed point of the return map while a number changes.
+
+The unknowns are the free components of the state and the number, each in units of its scale. A point of the branch is
+predicted along the tangent, and corrected by Newton's method in the hyperplane across the tangent, with the exact Jacobian of
+the return map by the state and the number. One compiled program serves all points, also of orbits of several returns. Source:
+Keller, Numerical solution of bifurcation and nonlinear eigenvalue problems, 1977; Kuznetsov, Elements of Applied Bifurcation
+Theory, ch. 10.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..compilation.xla_cpu import compiled_for_one
+
+if TYPE_CHECKING:
+    from .orbit import Orbit
+
+#: Kinds of special points, in the order of the first entries of `Point.tests`.
+KINDS = FOLD, DOUBLING, TORUS, CROSSING = "fold", "period doubling", "Neimark-Sacker", "branch point"
+GRAZING, REGULAR = "grazing", "regular"
+
+#: Why a branch ends where a return fails, by `Return.reason`, where the number of resets changes, and where Newton's method
+#: does not converge.
+ENDS = {
+    1: "the run ends, or does not cross the section again within t1",
+    2: "the return ends in another mode than the first",
+    5: "the run ends before the period",
+    6: "the integration fails",
+    7: "a reset is grazing, and the return map has no derivative",
+    8: "a reset falls on the end of the period; shift the phase of the drive",
+    10: "the number of resets in a period changes, so a margin touches zero",
+    11: "Newton's method does not converge, even with the smallest steps",
+}
+CHANGES, DIVERGES = 10, 11
+
+#: The largest step as a part of the range of the number; the smallest, as a part of the largest.
+STEPS, SMALLEST = 50, 1e-9
+
+#: The most Newton steps for a point, the number at which the length of a step stays, and the residual at which they have
+#: converged, in units of the tolerance.
+MOST_NEWTON, USUAL, CONVERGED = 8, 4, 0.3
+
+#: The integration is finer than the tolerance of the orbit by this factor.
+FINER = 100.0
+
+#: The smallest cosine of the angle between the tangents at neighbouring points.
+STRAIGHT = 0.9
+
+#: Test functions nearer to zero than this have no sign.
+NO_SIGN = 1e-9
+
+#: Singular values of the Jacobian by the unknowns below this, as a part of the largest, belong to a family of orbits.
+RANK = 1e-7
+
+#: A predicted state this near the section, in units of the time of a return, is moved onto it.
+NEAR = 0.05
+
+#: The distances from a branch at which another branch is looked for, in units of the scale of the state.
+ASIDE = (1e-2, 3e-3, 1e-3)
+
+
+class Returns(NamedTuple):
+    """Several returns as one map, from a `start` that was moved onto the section.
+
+    - `time` [s], `state`, `by_state`, `by_number`: of the last return, with its derivatives by the start and the number;
+      `time_by_state`, `time_by_number`: those of the time.
+    - `in_motion`, `reason`, `resets`: as for `Return`.
+    """
+
+    start: Array
+    time: Array
+    state: Array
+    by_state: Array
+    by_number: Array
+    time_by_state: Array
+    time_by_number: Array
+    in_motion: Array
+    reason: Array
+    resets: Array
+
+
+@compiled_for_one
+def several_returns(
+    search: Any,
+    leaves: tuple[Array, ...],
+    others: tuple[int, ...],
+    state: Float[Array, " components"],
+    rate: Array,
+    time: Array,
+    in_motion: Array,
+    tolerance: Array,
+    count: Array,
+) -> Returns:
+    """`count` returns from a state.
+
+    **Arguments:** `others`: the leaves that are the number; `rate`: derivative of the horizon by the number; `time`: about that
+    of a return [s]; `in_motion`: whether returns are not at a reset.
+    """
+
+    def following(k: Array, old: Returns) -> Returns:
+        moved, shift, falls = search.on_section(leaves, 1, old.state[:, None])
+        is_near = in_motion & falls[0] & (jnp.abs(shift[0]) < NEAR * time)
+        state = jnp.where(is_near, moved[:, 0], old.state)
+        left = jnp.where(old.reason > 0, 0.0, leaves[0])
+        new = search.returned(search.with_start(leaves, state[:, None]), 1, others, tolerance, left)
+        by_state, time_by_state = new.by_state[0], new.time_by_state[0]
+        by_number = sum((part[0] for part in new.by_numbers), jnp.zeros_like(state))
+        delay = sum((part[0] for part in new.time_by_numbers), jnp.zeros(()))
+        if search.is_driven:
+            by_number, delay = by_number + rate * new.rate[:, 0], rate
+        return Returns(
+            jnp.where(k == 0, state, old.start),
+            old.time + new.time[0],
+            new.state[:, 0],
+            by_state @ old.by_state,
+            by_state @ old.by_number + by_number,
+            old.time_by_state + time_by_state @ old.by_state,
+            old.time_by_number + time_by_state @ old.by_number + delay,
+            new.in_motion[0],
+            jnp.where(old.reason > 0, old.reason, new.reason[0]),
+            old.resets + new.resets[0],
+        )
+
+    zero, zeros, whole = jnp.zeros(()), jnp.zeros_like(state), jnp.zeros((), int)
+    slopes = (jnp.eye(len(state)), zeros, zeros, zero)
+    begin = Returns(state, zero, state, *slopes, jnp.asarray(False), whole, whole)
+    return jax.lax.fori_loop(0, count, following, begin)
+
+
+class Point(NamedTuple):
+    """A point of a branch.
+
+    - `unknowns`: the free components of the state and the number, in units of their scales; `matrix`: the derivative of the
+      residual by them, and `tangent`: of the branch.
+    - `state`, `value`, `period`, `error`: of the orbit, and the number; `jacobian`, `multipliers`: of the return map.
+    - `tests`: functions that change their signs at the `KINDS`, at the last value of the number and at the first.
+    - `iterations`, `resets`: number of Newton steps and of resets in a period.
+    """
+
+    unknowns: np.ndarray
+    matrix: np.ndarray
+    tangent: np.ndarray
+    state: np.ndarray
+    value: float
+    period: float
+    error: float
+    jacobian: np.ndarray
+    multipliers: np.ndarray
+    tests: np.ndarray
+    iterations: int
+    resets: int
+
+
+class Continuation(NamedTuple):
+    """The continuation of an orbit.
+
+    - `orbit`: a single orbit; `others`: the leaves that are the number; `period`: as for `Orbit.branch`.
+    - `first`, `last`: values of the number; `scale`: of the state; `returns`: number of returns in a period; `in_motion`:
+      whether they are not at a reset.
+    """
+
+    orbit: Any
+    others: tuple[int, ...]
+    period: Callable[[Array], Array] | None
+    first: float
+    last: float
+    scale: float
+    returns: int
+    in_motion: bool = True
+
+    @property
+    def begin(self) -> np.ndarray:
+        """The unknowns at the orbit."""
+        state = np.array(self.orbit.state)[list(self.orbit.search.free)]
+        return np.append(state / self.scale, self.first / (self.last - self.first))
+
+    def orbits(self, points: Sequence[Point]) -> "Orbit":
+        """The orbits of some points, as a batch."""
+        search, count = self.orbit.search, len(points)
+        states, values = np.stack([point.state for point in points]), np.array([point.value for point in points])
+        leaves = [np.broadcast_to(leaf, (count,)) for leaf in self.orbit.leaves]
+        for k in self.others:
+            leaves[k] = values
+        for k, column in zip(search.starts, states.T, strict=True):
+            leaves[k] = column
+        periods, errors = (np.array(part) for part in ([p.period for p in points], [p.error for p in points]))
+        if search.is_driven:
+            leaves[0] = periods / self.returns
+        numbers = (periods, states, np.stack([point.multipliers for point in points]), errors, errors)
+        iterations, none = np.array([point.iterations for point in points]), np.zeros(count, int)
+        counts = (none + int(self.orbit.family), iterations, none)
+        parts = jax.tree.map(jnp.asarray, (*numbers, *counts)), tuple(map(jnp.asarray, leaves))
+        return type(self.orbit)(*parts[0], self.orbit.names, parts[1], search, self.returns)
+
+    def evaluated(self, unknowns: np.ndarray) -> Returns:
+        """The returns from a state, for a value of the number."""
+        search, value = self.orbit.search, unknowns[-1] * (self.last - self.first)
+        leaves, rate = [np.asarray(leaf) for leaf in self.orbit.leaves], 0.0
+        for k in self.others:
+            leaves[k] = np.asarray(value)
+        if self.period is not None:
+            horizon, slope = jax.jvp(self.period, (jnp.asarray(value),), (jnp.ones(()),))
+            leaves[0], rate = np.asarray(horizon), float(slope)
+        state, tolerance = np.array(self.orbit.state), max(float(leaves[-1]) / FINER, 1e-14)
+        state[list(search.free)] = unknowns[:-1] * self.scale
+        time = float(self.orbit.period) / self.orbit.returns
+        numbers = map(np.asarray, (state, rate, time, self.in_motion, tolerance, self.returns))
+        return jax.tree.map(np.asarray, several_returns(search, tuple(leaves), self.others, *numbers))
+
+    def linearized(self, unknowns: np.ndarray) -> tuple[Returns, np.ndarray, np.ndarray]:
+        """The returns, the derivative of the residual by the unknowns, and the unknowns at the start that was moved."""
+        new, free = self.evaluated(unknowns), list(self.orbit.search.free)
+        by_number = new.by_number[:, None] * ((self.last - self.first) / self.scale)
+        matrix = np.hstack([(np.eye(len(new.state)) - new.by_state)[:, free], -by_number])
+        return new, matrix, np.append(new.start[free] / self.scale, unknowns[-1])
+
+    def corrected(self, guess: np.ndarray, tangent: np.ndarray) -> Point | int:
+        """The point of the branch in the hyperplane through a guess across the tangent, or an entry of `ENDS`."""
+        unknowns, tolerance = guess, float(self.orbit.leaves[-1])
+        for iteration in range(1, MOST_NEWTON + 1):
+            new, matrix, unknowns = self.linearized(unknowns)
+            if new.reason > 0 or not np.isfinite(matrix).all():
+                return int(new.reason) or DIVERGES
+            miss, rows = (new.state - new.start) / self.scale, np.vstack([matrix, tangent])
+            change = np.linalg.lstsq(rows, np.append(miss, tangent @ (guess - unknowns)), rcond=None)[0]
+            unknowns = unknowns + change
+            size = max(1.0, float(np.abs(new.by_state).max()))
+            if max(np.abs(miss).max() / size, np.abs(change).max() * tolerance**0.5) <= CONVERGED * tolerance:
+                along = np.linalg.svd(matrix)[2][-1]
+                along = along if along @ tangent >= 0.0 else -along
+                return self.point(new, matrix, along, unknowns, change, iteration)
+        return DIVERGES
+
+    def point(
+        self,
+        new: Returns,
+        matrix: np.ndarray,
+        tangent: np.ndarray,
+        unknowns: np.ndarray,
+        change: np.ndarray,
+        steps: int,
+    ) -> Point:
+        """The point with these unknowns, after the last step of Newton's method, their `change`."""
+        search, span = self.orbit.search, self.last - self.first
+        state, moved = np.array(new.start), np.zeros(len(new.start))
+        moved[list(search.free)] = change[:-1] * self.scale
+        state[list(search.free)] = unknowns[:-1] * self.scale
+        value = float(unknowns[-1]) * span
+        period = float(new.time + new.time_by_state @ moved + new.time_by_number * change[-1] * span)
+        values = np.linalg.eigvals(new.by_state).astype(complex)
+        values = values[np.argsort(-np.abs(values), kind="stable")]
+        pairs = (values[:, None] * values)[np.triu_indices(len(values), 1)]
+        # The multipliers of conservative motions come in pairs whose product is 1.
+        rotation = 1.0 if self.orbit.family else np.prod(pairs - 1.0).real
+        rows = np.vstack([matrix, tangent])
+        crossing = np.linalg.det(rows) if rows.shape[0] == rows.shape[1] else 1.0
+        bounds = ((value - self.last) / span, (value - self.first) / span)
+        tests = np.array([tangent[-1], np.prod(values + 1.0).real, rotation, crossing, *bounds])
+        multipliers = values[: len(values) - (not search.is_driven)]
+        error = max(5.0 * float(np.abs(change).max()), 1e-14) * self.scale
+        numbers = (value, period, error, np.asarray(new.by_state), multipliers, tests, steps, int(new.resets))
+        return Point(unknowns, matrix, tangent, state, *numbers)
+
+    def between(self, old: Point, new: Point, distance: float) -> Point | int:
+        """The point that cubic interpolation gives: near a branch point, Newton's method may converge to the other branch."""
+        length = float(old.tangent @ (new.unknowns - old.unknowns))
+        slope, chord = new.tangent / (new.tangent @ old.tangent), (new.unknowns - old.unknowns) / length
+        bend, twist = 3.0 * chord - 2.0 * old.tangent - slope, old.tangent + slope - 2.0 * chord
+        part = distance / length
+        tangent = old.tangent + 2.0 * part * bend + 3.0 * part**2 * twist
+        unknowns = old.unknowns + distance * (old.tangent + part * bend + part**2 * twist)
+        returns, matrix, moved = self.linearized(unknowns)
+        if returns.reason > 0 or not np.isfinite(matrix).all():
+            return int(returns.reason) or DIVERGES
+        return self.point(returns, matrix, tangent / np.linalg.norm(tangent), moved, np.zeros_like(moved), 0)
+
+    def located(self, old: Point, new: Point, length: float, test: int) -> tuple[float, Point] | None:
+        """Where a test function vanishes between two points: the distance from the first, and the point."""
+        from scipy.optimize import brentq
+
+        points = {0.0: old, length: new}
+
+        def value(distance: float) -> float:
+            if distance not in points:
+                is_crossing = test == KINDS.index(CROSSING)
+                guess = old.unknowns + distance * old.tangent
+                point = self.between(old, new, distance) if is_crossing else self.corrected(guess, old.tangent)
+                if isinstance(point, int):
+                    raise ArithmeticError
+                points[distance] = point
+            return float(points[distance].tests[test])
+
+        if abs(new.tests[test]) <= NO_SIGN:
+            return length, new
+        try:
+            root: float = brentq(value, 0.0, length, xtol=1e-13)  # type: ignore[assignment]
+            value(root)
+        except ArithmeticError:
+            return None
+        return root, points[root]
+
+    def specials(self, old: Point, new: Point, length: float) -> list[tuple[float, int, Point]] | None:
+        """The zeros of the test functions between two points, in order; `None` if one cannot be located."""
+        zeros = []
+        for test, (before, after) in enumerate(zip(old.tests, new.tests, strict=True)):
+            if abs(before) <= NO_SIGN or (abs(after) > NO_SIGN and before * after > 0.0):
+                continue
+            zero = self.located(old, new, length, test)
+            if zero is None:
+                return None
+            # Two real multipliers whose product is 1 are no Neimark-Sacker point.
+            if test != KINDS.index(TORUS) or is_rotating(zero[1].multipliers):
+                zeros.append((zero[0], test, zero[1]))
+        return sorted(zeros, key=lambda zero: zero[:2])
+
+    def followed(self, step: float, count: int) -> "tuple[list[Point], list[str], str]":
+        """The points of the branch, their kinds, and why it ends. **Arguments:** `step`: largest, as a part of the range of the
+        number; `count`: number of points."""
+        begin = self.begin
+        start = self.corrected(begin, np.eye(len(begin))[-1])
+        if isinstance(start, int):
+            raise ValueError(f"the orbit: there is no branch from {self.first:.10g}: {ENDS[start]}")
+        singular = np.linalg.svd(start.matrix, compute_uv=False)
+        if singular[len(begin) - 2] <= RANK * max(1.0, singular[0]):
+            raise ValueError(
+                "the orbit is one of a family, for a fixed number; pass free= to periodic_orbit, so that it is the only one"
+            )
+        points, kinds, length, is_free = [start], [REGULAR], 0.25 * step, True
+        problem = 0
+        while len(points) < count:
+            old = points[-1]
+            new = self.corrected(old.unknowns + length * old.tangent, old.tangent)
+            problem = new if isinstance(new, int) else CHANGES if new.resets != old.resets else 0
+            zeros = None
+            if not isinstance(new, int) and not problem and new.tangent @ old.tangent >= STRAIGHT:
+                zeros = self.specials(old, new, length)
+            if isinstance(new, int) or zeros is None:
+                length, is_free = 0.5 * length, False
+                if length < SMALLEST * step:
+                    kinds[-1] = GRAZING if problem in (7, CHANGES) else kinds[-1]
+                    return points, kinds, ENDS[problem or DIVERGES]
+                continue
+            for _, test, point in zeros:
+                if test >= len(KINDS):
+                    word = "the end of the range" if test == len(KINDS) else "its first value again"
+                    return [*points, point], [*kinds, REGULAR], f"the number reaches {word}"
+                points, kinds = [*points, point], [*kinds, KINDS[test]]
+            if points[-1] is not new:
+                points, kinds = [*points, new], [*kinds, REGULAR]
+            factor = 1.5 if is_free and new.iterations < USUAL else 1.0 if new.iterations <= USUAL else 0.5
+            length, is_free = min(factor * length, step), True
+        return points, kinds, f"there are {count} points; pass points= for more"
+
+
+def is_rotating(multipliers: np.ndarray) -> bool:
+    """Whether the pair of multipliers whose product is nearest to 1 is complex."""
+    rows, columns = np.triu_indices(len(multipliers), 1)
+    nearest = np.argmin(np.abs(multipliers[rows] * multipliers[columns] - 1.0))
+    return bool(np.imag(multipliers[rows[nearest]]) != 0.0)
