@@ -92,8 +92,8 @@ PAGES = {
         [
             *of(
                 "nonholonomic",
-                "event_time crossings periodic_orbit Orbit Branch SpecialPoint lyapunov_exponent lyapunov_spectrum "
-                "LyapunovSpectrum",
+                "event_time crossings bifurcation basins periodic_orbit Orbit Branch SpecialPoint lyapunov_exponent "
+                "lyapunov_spectrum LyapunovSpectrum",
             ),
             *of(
                 "tippe",

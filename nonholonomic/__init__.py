@@ -31,6 +31,11 @@ from .geometry import Torus as Torus
 from .identification import FitWarning as FitWarning
 from .identification import Free as Free
 from .integration.problem import Status as Status
+from .runs.attractors import LyapunovSpectrum as LyapunovSpectrum
+from .runs.attractors import basins as basins
+from .runs.attractors import bifurcation as bifurcation
+from .runs.attractors import lyapunov_exponent as lyapunov_exponent
+from .runs.attractors import lyapunov_spectrum as lyapunov_spectrum
 from .runs.branch import Branch as Branch
 from .runs.branch import SpecialPoint as SpecialPoint
 from .runs.crossings import crossings as crossings
@@ -39,9 +44,6 @@ from .runs.identify import EventTimes as EventTimes
 from .runs.identify import Recording as Recording
 from .runs.identify import identify as identify
 from .runs.identify import log_density as log_density
-from .runs.lyapunov import LyapunovSpectrum as LyapunovSpectrum
-from .runs.lyapunov import lyapunov_exponent as lyapunov_exponent
-from .runs.lyapunov import lyapunov_spectrum as lyapunov_spectrum
 from .runs.orbit import Orbit as Orbit
 from .runs.orbit import periodic_orbit as periodic_orbit
 from .runs.simulate import simulate as simulate

@@ -14,7 +14,7 @@ from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
 from nonholonomic.integration.problem import Status as Status
-from nonholonomic.runs.lyapunov import LyapunovExponent as LyapunovExponent
+from nonholonomic.runs.attractors import LyapunovExponent as LyapunovExponent
 from nonholonomic.sweeps import Table as Table
 
 from . import presets as presets

@@ -273,7 +273,8 @@ class Table(eqx.Module):
         label: str | None = None,
         unit: str | Sequence[str] | None = None,
     ) -> Any:
-        """Draw a variable over the grid (needs matplotlib): lines over the first axis, or a map of the first two.
+        """Draw a variable over the grid (needs matplotlib): lines over the first axis, a map of the first two, or all crossings
+        as points.
 
         For other axes, the plot uses the first value, or the value in `at`, and states the value in the title. The
         colours of a map range from the 2 % to the 98 % quantile.

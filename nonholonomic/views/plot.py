@@ -35,6 +35,12 @@ ROUND_OFF = 1e-9
 #: An axis with at most this many values is drawn as one line per value.
 MOST_LINES = 8
 
+#: More points of a bifurcation diagram than this are drawn smaller.
+MOST_POINTS = 2000
+
+#: A map of whole numbers with at most this many values has a colour for each.
+MOST_COLOURS = 10
+
 #: Number of characters for which a legend above the panels has room.
 WIDTH = 90
 
@@ -99,20 +105,26 @@ def draw_table(
     has_status = "status" in table.variables and not table.inner.get(variable)
     words = _slice(table.variables["status"], dims, names, cut) if has_status else None
     drawing = new_figure().add_subplot() if ax is None else ax
-    drawing.set_xlabel(table.label(names[0]))
     cuts = [_cut_text(table, name, place, at.get(name)) for name, place in cut.items()]
-    if len(names) == 1 or (y is None and len(table.coords[names[1]]) <= MOST_LINES):
-        _draw_lines(drawing, table, names, visible.reshape(len(visible), -1), label, words)
-        drawing.set_ylabel(table.label(variable))
-        if log:
-            drawing.set_yscale("log")
-            _plain_numbers(drawing.yaxis)
-    else:
-        drawing.set_ylabel(table.label(names[1]))
+    is_diagram = x is None and len(names) == 2 and names[0] == "crossing"
+    is_map = len(names) == 2 and not is_diagram and (y is not None or len(table.coords[names[1]]) > MOST_LINES)
+    drawing.set_ylabel(table.label(names[1] if is_map else variable))
+    if is_map:
         cuts = [label, *cuts] if label else cuts
-        _draw_map(drawing, table, names, visible, table.label(variable), log)
+        _draw_map(drawing, table, names, visible, table.label(variable), log, values.dtype.kind in "iu")
         if words is not None:
             _mark_words(drawing, table, names, np.where(np.isnan(visible), words, ""))
+    elif is_diagram:
+        # All crossings over an axis: a bifurcation diagram.
+        names, abscissa = names[1:], np.broadcast_to(table.coords[names[1]], visible.shape)
+        size = 2.0 * math.sqrt(MOST_POINTS / max(visible.size, MOST_POINTS))
+        drawing.plot(abscissa.ravel(), visible.ravel(), "o", markersize=size, mew=0.0, label=label, rasterized=True)
+    else:
+        _draw_lines(drawing, table, names, visible.reshape(len(visible), -1), label, words)
+    if log and not is_map:
+        drawing.set_yscale("log")
+        _plain_numbers(drawing.yaxis)
+    drawing.set_xlabel(table.label(names[0]))
     drawing.set_title(", ".join(cuts), fontsize="medium")
     return drawing.figure if ax is None else ax
 
@@ -202,13 +214,22 @@ def _draw_lines(
         drawing.text(0.5, 0.5, text, transform=drawing.transAxes, ha="center", va="center")
 
 
-def _draw_map(drawing: "Axes", table: "Table", names: list[str], visible: np.ndarray, label: str, log: bool) -> None:
-    from matplotlib.colors import LogNorm, Normalize
+def _draw_map(
+    drawing: "Axes", table: "Table", names: list[str], visible: np.ndarray, label: str, log: bool, is_whole: bool
+) -> None:
+    from matplotlib.colors import ListedColormap, LogNorm, Normalize
 
     values = visible[np.isfinite(visible) & (visible > 0.0)] if log else visible[np.isfinite(visible)]
+    x, y = table.coords[names[0]], table.coords[names[1]]
+    if is_whole and not log and len(kinds := np.unique(values)) <= MOST_COLOURS:
+        colours = ListedColormap(["0.85" if kind == 0 else f"C{number}" for number, kind in enumerate(kinds)])
+        image = drawing.pcolormesh(x, y, np.searchsorted(kinds, visible.T), shading="nearest", cmap=colours)
+        image.set_clim(-0.5, len(kinds) - 0.5)
+        bar = drawing.figure.colorbar(image, ax=drawing, label=label, ticks=range(len(kinds)))
+        bar.ax.set_yticklabels([f"{kind:.0f}" for kind in kinds])
+        return
     low, high = np.quantile(values, QUANTILES) if values.size else (0.0, 1.0)
     scale = (LogNorm if log else Normalize)(low, high)
-    x, y = table.coords[names[0]], table.coords[names[1]]
     image = drawing.pcolormesh(x, y, visible.T, shading="nearest", norm=scale)
     is_clipped = (bool(np.any(values < low)), bool(np.any(values > high)))
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(is_clipped, "neither")

@@ -27,8 +27,8 @@ from nonholonomic.integration.problem import (
     run_bounds,
 )
 from nonholonomic.parameters import full_axes, numbers, with_numbers
+from nonholonomic.runs.attractors import LyapunovExponent, exponent_of_model
 from nonholonomic.runs.event import EventTime, time_of_event
-from nonholonomic.runs.lyapunov import LyapunovExponent, exponent_of_model
 from nonholonomic.runs.model import Number, settings_for_lanes
 from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_sensitivities, samples_of
 from nonholonomic.runs.table import TableForm, TableJob

@@ -134,6 +134,17 @@ def test_runs_have_a_lyapunov_exponent(case):
 
 
 @of_own_modes
+def test_what_runs_settle_to(case):
+    axes = {case.parameter: case.value * np.array([1.0, 1.01])}
+    options = dict(axes=axes, quantities=[case.quantity], progress=False)
+    table = nonholonomic.basins(case.system, case.start, case.t1, **options)
+    assert set(table.attractor.tolist()) <= {0, 1, 2}
+    assert (table[f"{case.quantity}_min"] <= table[f"{case.quantity}_max"]).all()
+    diagram = nonholonomic.bifurcation(case.system, case.start, case.t1, case.event, 1, 0, **options)
+    assert diagram[case.quantity].shape == (2, 1)
+
+
+@of_own_modes
 def test_runs_are_drawn_and_explored(case, tmp_path):
     path = tmp_path / "page.html"
     sliders = {case.parameter: (0.9 * case.value, 1.1 * case.value)}

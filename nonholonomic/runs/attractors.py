@@ -1,5 +1,9 @@
-"""The Lyapunov exponents of a run of any model: whether nearby runs diverge exponentially, and how fast."""
+"""What runs do in the long term: Lyapunov exponents, bifurcation diagrams, and basins of attraction."""
 
+import dataclasses
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import diffrax
@@ -14,11 +18,19 @@ from ..derivatives.variation import in_stretches, orthonormalised
 from ..hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
 from ..hybrid.saltation import variational_modes, variational_start
 from ..integration import Outcome, Settings
-from ..integration.problem import Status
+from ..integration.problem import DEFAULT_MAX_STEPS, Status
+from ..sweeps import Axis, Table, Variable
 from ..terminal import status_line
-from ..validation import explaining, require_outside, require_whole
+from ..text import shown
+from ..validation import Bound, explaining, require_outside, require_whole
+from .crossings import crossings
 from .event import modes_of
-from .model import AbstractModel, check_run, model_of, settings_for_lanes
+from .model import AbstractModel, AbstractSceneModel, check_horizon, check_run, model_of, settings_for_lanes
+from .simulate import Samples
+from .sweep import Options, named_axes, require_names, table_of
+from .table import TableForm
+
+# Lyapunov exponents: whether nearby runs diverge exponentially, and how fast.
 
 #: What to use instead of transformations, in the message.
 INSTEAD = "a Python loop (for tops, tippe.lyapunov_exponent takes lists) in place of vmap"
@@ -342,3 +354,221 @@ def _rescaled(
     logarithm, frame = orthonormalised(tangents / magnitudes)
     unit = jnp.concatenate([primal[None], frame * magnitudes])
     return logarithm, jnp.concatenate([unit, jnp.zeros_like(unit[:, :1])], axis=1).reshape(state.shape)
+
+
+# Bifurcation diagrams and basins of attraction.
+
+
+def bifurcation(
+    system: object,
+    start: object,
+    t1: float,
+    event: Callable[..., Any] | None = None,
+    count: int = 100,
+    skip: int = 300,
+    *,
+    axes: dict[str, Any],
+    **options: Any,
+) -> Table:
+    """The last returns of runs to a section over one number: a bifurcation diagram, which `plot` draws as points.
+
+    **Arguments:**
+
+    - `system`, `start`, `t1`, `event`, `count`, `skip`: as for `crossings`; runs should settle in the returns that are left
+      out. `options`: further arguments of `crossings`.
+    - `axes`: full name of one parameter -> values.
+
+    **Returns:** a `Table` as that of `crossings`, over the number and the axis `crossing`.
+
+    **Raises:** as `crossings`, and `ValueError` for several axes.
+
+    **Example:** the logistic map, once a second: one value, and beyond 3 two.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Logistic(nonholonomic.AbstractMode):
+    ...     rate: float
+    ...
+    ...     def field(self, t, y):
+    ...         return jnp.array([0.0, 1.0])
+    ...
+    ...     def margin(self, t, y):
+    ...         return 1.0 - y[1]
+    ...
+    ...     def reset(self, t, y):
+    ...         return jnp.array([self.rate * y[0] * (1.0 - y[0]), 0.0]), 0
+    >>> def middle(t, y):
+    ...     return 0.5 - y[1]
+    >>> system = nonholonomic.Hybrid([Logistic(2.8)])
+    >>> axes = {"rate": [2.8, 3.2]}
+    >>> diagram = nonholonomic.bifurcation(system, [0.4, 0.0], 500.0, middle, 4, axes=axes, progress=False)
+    >>> print(diagram.y0.round(4))
+    [[0.6429 0.6429 0.6429 0.6429]
+     [0.513  0.7995 0.513  0.7995]]
+
+    ```
+    """
+    if not isinstance(axes, dict) or len(axes) != 1:
+        raise ValueError(f"axes = {shown(axes)} must name one parameter and its values; crossings takes several")
+    return crossings(system, start, t1, event, count, skip, axes=axes, **options)
+
+
+#: What is known of each quantity, as the ends of the names of variables.
+KINDS = ("min", "max", "change", "range")
+
+
+class Ranges(Samples):
+    """The ranges of quantities in the last quarter of runs, how they change from the quarter before, and in whole runs."""
+
+    def variables(self, model: AbstractModel) -> dict[str, Variable]:
+        """The variables of the table with the ranges."""
+        return {
+            f"{name}_{kind}": variable._replace(inner=(), long_name=f"{word} {variable.long_name}")
+            for name, variable in super().variables(model).items()
+            for kind, word in zip(KINDS, ("least", "greatest", "change of", "range of"), strict=True)
+        }
+
+    def inner(self, model: AbstractModel) -> list[Axis]:
+        """These variables have no further dimensions."""
+        return []
+
+    def solve(
+        self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
+    ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
+        """The `Status` of all cells, of which only the first `count` are run, and the variables of the table."""
+        status, values = super().solve(cells, t1, size, count, settings)
+        for name in self.names:
+            quarters = jnp.stack(jnp.split(jnp.asarray(values.pop(name)), 4, axis=1))
+            least, greatest = jnp.min(quarters, axis=2), jnp.max(quarters, axis=2)
+            change = jnp.maximum(jnp.abs(least[3] - least[2]), jnp.abs(greatest[3] - greatest[2]))
+            parts = (least[3], greatest[3], change, jnp.max(greatest, axis=0) - jnp.min(least, axis=0))
+            values |= {f"{name}_{kind}": part for kind, part in zip(KINDS, parts, strict=True)}
+        return status, jax.tree.map(np.asarray, values)
+
+
+#: Number of samples in each quarter of a run.
+SAMPLED = 250
+
+
+@explaining
+def basins(
+    system: object,
+    start: object,
+    t1: float,
+    *,
+    axes: dict[str, Any],
+    quantities: Sequence[str] | None = None,
+    resolution: float = 0.05,
+    scattered: bool = False,
+    max_steps: int = DEFAULT_MAX_STEPS,
+    tolerance: float = 1e-6,
+    solver: diffrax.AbstractERK | None = None,
+    path: str | Path | None = None,
+    progress: bool = True,
+    executor: Executor | None = None,
+    input: object = None,
+    jumps: object = None,
+) -> Table:
+    """Basins of attraction: which attractor the run of each cell reaches. The attractors are found, not given.
+
+    Two runs have the same attractor if their quantities have the same least and greatest values in the last quarter of the run,
+    or if other runs lead from one to the other. A run has settled if these are as in the quarter before. For other ways see
+    G. Datseris and A. Wagemakers, Chaos 32 (2022) 023104.
+
+    **Arguments:**
+
+    - `system`, `start`, `axes`, `input`, `jumps`, `scattered`, `max_steps`, `tolerance`, `solver`, `path`, `progress`,
+      `executor`: as for `sweep`; axes are often components of the start, such as `"start[0]"`.
+    - `t1`: horizon [s]; runs should settle in the first half of it.
+    - `quantities`: names of scalar quantities that tell attractors apart and stay within bounds, by default all components of
+      your own system. Leave out an angle that grows.
+    - `resolution`: difference below which values are the same, as a fraction of the range of the quantity: in a usual run, or
+      over the attractors if that is more.
+
+    **Returns:** a `Table` with `attractor`: 1 for that of most cells, 2 for the next and so on, 0 where a run has not settled
+    or ended before `t1`; for each quantity, such as `y0`, its least and greatest values in the last quarter of the run as
+    `y0_min` and `y0_max`, their greatest change from the quarter before as `y0_change`, and the range of the whole run as
+    `y0_range`; `status`, `end_time`, `steps`, `rejected`. `plot("attractor")` draws a map.
+
+    **Raises:** as `sweep`.
+
+    **Example:** a ball in two valleys, which finds the nearer one from these starts.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Valleys(nonholonomic.AbstractMode):
+    ...     damping: float
+    ...
+    ...     def field(self, t, y):
+    ...         return jnp.array([y[1], y[0] - y[0] ** 3 - self.damping * y[1]])
+    >>> system = nonholonomic.Hybrid([Valleys(1.0)])
+    >>> axes = {"start[0]": [-1.2, -0.4, 0.3, 0.8, 1.1]}
+    >>> table = nonholonomic.basins(system, [0.0, 0.0], t1=60.0, axes=axes, progress=False)
+    >>> print(table.attractor, table.y0_min.round(3))
+    [2 2 1 1 1] [-1. -1.  1.  1.  1.]
+
+    ```
+    """
+    require_outside((system, start, t1, axes, input), "basins", "simulate")
+    Bound(resolution, "resolution", above=0.0, below=1.0).require()
+    model = model_of(system, start, None, input, jumps).without_event()
+    check_horizon(t1, tolerance)
+    is_scene = isinstance(model, AbstractSceneModel)
+    if quantities is None and is_scene:
+        raise ValueError(
+            "quantities = None: name quantities of the scene that tell attractors apart, such as ['theta']"
+        )
+    names = tuple(model.quantities) if quantities is None else quantities
+    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
+        raise ValueError(f"quantities = {shown(quantities)} must be a list of names")
+    require_names(model.quantities, names)
+    vectors = [name for name in names if model.quantities[name][2] is not None]
+    if vectors:
+        raise ValueError(f"quantities: {vectors[0]!r} is a vector; name scalar quantities")
+    # Times in the golden ratio do not keep step with a drive.
+    shares = np.sort(np.arange(SAMPLED) * 0.6180339887498949 % 1.0)
+    times = 0.25 * float(t1) * (np.arange(4)[:, None] + shares).ravel()
+    options = Options(tolerance, solver, max_steps, scattered, False, (), path, progress, executor)
+    samples, named = Ranges(times, tuple(names)), named_axes(model, axes)
+    table = table_of(model, named, float(t1), "first", options, TableForm(), samples=samples, timed=False)
+    return dataclasses.replace(
+        table,
+        variables={"attractor": attractors_of(table, tuple(names), resolution), **table.variables},
+        units=table.units | {"attractor": "1"},
+        long_names=table.long_names | {"attractor": "attractor"},
+    )
+
+
+def attractors_of(table: Table, names: tuple[str, ...], resolution: float) -> Int[np.ndarray, "..."]:
+    """The number of the attractor of each cell."""
+    # SciPy's trees are imported only here.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    completed = table.status == Status.COMPLETED.word
+    has_settled = np.array(completed)
+    rows: list[Float[np.ndarray, " cells"]] = []
+    for name in names:
+        least, greatest, change, whole = (np.asarray(table[f"{name}_{kind}"]) for kind in KINDS)
+        if not completed.any():
+            break
+        low, high = np.quantile(least[completed], 0.01), np.quantile(greatest[completed], 0.99)
+        # All runs of a quantity that does not change have one value.
+        step = resolution * (max(high - low, np.median(whole[completed])) or 1.0)
+        has_settled &= change <= step
+        rows += [part / step for part in (least, greatest)]
+    number = np.zeros(np.shape(completed), int)
+    if not has_settled.any():
+        return number
+    places = np.round(np.stack([row[has_settled] for row in rows], axis=-1))
+    places, place = np.unique(places, axis=0, return_inverse=True)
+    pairs = KDTree(places).query_pairs(1.5, p=np.inf, output_type="ndarray")
+    near = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(places), len(places)))
+    _, group = connected_components(near, directed=False)
+    groups = group[place.ravel()]
+    by_size = np.argsort(-np.bincount(groups), kind="stable")
+    number[has_settled] = 1 + np.argsort(by_size)[groups]
+    return number
