@@ -153,6 +153,10 @@ SUSPECTED = {
         "spin = 20 rad/s is slow: this top needs about 76.9 rad/s to turn over; was it in turns a second? "
         "20 turns a second are 125.7 rad/s",
     ),
+    "turns a second of a run": (
+        lambda: tippe.simulate(TOP, tippe.Launch(0.1, 20.0), 1.0),
+        "spin = 20 rad/s is slow: this top needs about 76.9 rad/s to turn over; was it in turns a second?",
+    ),
     "turns a second in a table": (
         lambda: tippe.inversion_table(TOP, theta=[0.1, 0.2], spin=[15.0, 20.0], t1=1.0),
         "spin = 20 rad/s is slow: this top needs about 76.9 rad/s to turn over; was it in turns a second?",
@@ -185,6 +189,7 @@ LINES = {line for call, _ in SUSPECTED.values() for *_, line in call.__code__.co
 def nothing_runs(monkeypatch):
     """What would run says that it was asked to."""
     monkeypatch.setattr(importlib.import_module("tippe.runs.verbs"), "time_of_event", lambda *_: jnp.inf)
+    monkeypatch.setattr(importlib.import_module("tippe.runs.verbs"), "simulate_launch", lambda *_: None)
     monkeypatch.setattr(
         importlib.import_module("tippe.runs.verbs"), "compute_table", lambda *_, **__: table_of_times([5.0], [9])
     )

@@ -103,10 +103,17 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: obj
             f"theta = {start:g} rad is not below {reached}, {float(np.min(limit)):.4g} rad: the top "
             f"{'stands on its stem' if on_stem else 'is inverted'} from the start{IN_DEGREES.format(f'{start:g}')}"
         )
-    at_rest = launch.velocity is None and launch.angular_velocity is None
-    if scene.level and at_rest and np.any(np.asarray(theta) == 0.0):
+    is_at_rest = launch.velocity is None and launch.angular_velocity is None
+    if scene.level and is_at_rest and np.any(np.asarray(theta) == 0.0):
         warn("theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad")
-    if not isinstance(scene.body, Top) or not at_rest or is_traced((scene, spin)):
+    warn_if_slow(scene, launch, theta, spin, limit)
+
+
+def warn_if_slow(scene: Scene, launch: Launch, theta: Any, spin: object, limit: Any) -> None:
+    """Warn if a top is too slow to turn over, and would not be in another unit of its spin. **Arguments:** as for
+    `warn_if_it_cannot_invert`; `limit`: the angle to be reached [rad]."""
+    at_rest = launch.velocity is None and launch.angular_velocity is None
+    if not isinstance(scene.body, Top) or not at_rest or is_traced((scene, theta, spin, limit)):
         return
     # The spin of which Jellett's constant is that of the tumbling top at the angle (`steady.tumbling`).
     body, fastest = scene.body, float(np.max(np.abs(np.asarray(spin))))
@@ -611,6 +618,7 @@ def simulate(
     ```
     """
     check_run(scene, launch, t1, tolerance, "jax.vmap(simulate) takes lists, and so does trajectory_table")
+    warn_if_slow(scene, launch, launch.theta, launch.spin, angle_of(scene, None))
     return simulate_launch(TopModel(scene=scene, launch=launch), t1, times, tolerance, solver, adjoint)
 
 
