@@ -55,7 +55,8 @@ class Progress:
         """
         self._total, self._unit, self._doing = total, unit, doing
         self._watched = is_watched()
-        self._heard = not is_off("NONHOLONOMIC_PROGRESS") and (self._watched or (is_open() and not self._has_told))
+        can_tell = not self._has_told and not getattr(sys.stderr, "closed", sys.stderr is None)
+        self._heard = not is_off("NONHOLONOMIC_PROGRESS") and (self._watched or can_tell)
         self._shown = shown
         self._done, self._first, self._since, self._notes = 0, 0, None, {}
         self._bar: Any = None
@@ -180,12 +181,8 @@ def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
 def is_watched() -> bool:
     """Whether a status line would be visible: standard error is a terminal, or this process is a notebook."""
     # A closed stream raises an error.
-    return (is_open() and sys.stderr.isatty()) or is_notebook()
-
-
-def is_open() -> bool:
-    """Whether this process has a standard error that is not closed."""
-    return sys.stderr is not None and not getattr(sys.stderr, "closed", False)
+    is_open = not getattr(sys.stderr, "closed", False)
+    return (is_open and getattr(sys.stderr, "isatty", bool)()) or is_notebook()
 
 
 def is_notebook() -> bool:

@@ -307,10 +307,7 @@ class Plane(AbstractSurface):
     tilt: Float[Array, "..."] | None = eqx.field(
         converter=none_if_zero,
         default=None,
-        metadata={
-            "range": {"at_least": -math.pi / 2.0, "at_most": math.pi / 2.0, "unit": "rad"},
-            "usual": Usual(0.9),
-        },
+        metadata={"range": {"at_least": -math.pi / 2.0, "at_most": math.pi / 2.0, "unit": "rad"}, "usual": Usual(0.9)},
     )
 
     @property

@@ -329,9 +329,7 @@ class TextTable(NamedTuple):
         if decimal not in (".", ","):
             raise ValueError(f"decimal = {shown(decimal)} must be '.' or ','")
         if columns is not None and (not isinstance(columns, Mapping) or not columns):
-            raise ValueError(
-                f"columns = {shown(columns)} must be a dictionary, as {{'theta': ('tilt', 'deg')}}, or None"
-            )
+            raise ValueError(f"columns = {shown(columns)} must be a dictionary, as {{'theta': ('tilt', 'deg')}}")
         path = as_path(path, "path")
         lines = enumerate(_text(path).splitlines(), start=1)
         text = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]

@@ -609,9 +609,7 @@ def sample(
         # A component around a fit.
         numbers, covariance = len(density.problem.names), np.asarray(covariance, float)
         if covariance.shape != (numbers, numbers) or not np.all(np.isfinite(covariance)):
-            raise ValueError(
-                f"covariance must be finite and of shape {(numbers, numbers)}: the data do not fix all numbers"
-            )
+            raise ValueError(f"covariance must be finite and of shape {(numbers, numbers)}: data do not fix all")
         if np.shape(centre) != (numbers,):
             raise ValueError(f"centre = {shown(centre)} must be of shape {(numbers,)}")
         known = Mixture(np.ones(1), np.asarray(centre, float)[None], np.linalg.cholesky(covariance)[None])

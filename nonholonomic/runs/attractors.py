@@ -359,6 +359,7 @@ def _rescaled(
 # Bifurcation diagrams and basins of attraction.
 
 
+@explaining
 def bifurcation(
     system: object,
     start: object,

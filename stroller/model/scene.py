@@ -170,9 +170,7 @@ class Scene(Bounded):
                 raise ValueError(f"{name} = {shown(word)} must be one of {', '.join(map(repr, words))}")
         self.surface.sign(self.side, DRIVES)
         if not isinstance(self.surface, Plane) and self.body.centre is not None:
-            raise ValueError(
-                f"centre = {shown(self.body.centre)} must be 0.0 on curved surfaces, where it is not exact"
-            )
+            raise ValueError(f"centre = {shown(self.body.centre)} must be 0.0 on curved ground, where it is not exact")
         if self.heading == "projected" and not isinstance(self.surface, Plane | AbstractQuadric):
             raise ValueError(f"heading = 'projected' must be 'intrinsic' on a {type(self.surface).__name__}")
 

@@ -584,9 +584,7 @@ def even_steps(
     """
     for name, number in {"t1": t1, "times": times, "step_length": max_duration}.items():
         if validation.is_traced(number):
-            raise ValueError(
-                f"{name} is traced and must be known for ImplicitMidpoint, whose steps have a fixed length"
-            )
+            raise ValueError(f"{name} is traced and must be known for ImplicitMidpoint, whose steps are fixed")
     knots = np.union1d(np.asarray(times), [0.0, float(t1)])
     counts = np.ceil(np.diff(knots) / float(max_duration) * (1.0 - 1e-12)).astype(int)
     pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]

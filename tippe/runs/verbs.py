@@ -109,7 +109,7 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: obj
     warn_if_slow(scene, launch, theta, spin, limit)
 
 
-def warn_if_slow(scene: Scene, launch: Launch, theta: Any, spin: object, limit: Any) -> None:
+def warn_if_slow(scene: Scene, launch: Launch, theta: ArrayLike, spin: object, limit: ArrayLike) -> None:
     """Warn if a top is too slow to turn over, and would not be in another unit of its spin. **Arguments:** as for
     `warn_if_it_cannot_invert`; `limit`: the angle to be reached [rad]."""
     at_rest = launch.velocity is None and launch.angular_velocity is None
