@@ -4,6 +4,10 @@ All points keep their predictions, so the weights of all of them are computed ag
 change (Cornuet, Marin, Mira and Robert, "Adaptive multiple importance sampling", Scand. J. Stat. 39 (2012) 798). Until
 the proposals cover the posterior, the likelihood is tempered: the powers of early measurements grow first, because late
 samples of a recording can be wrong by whole turns.
+
+The density of a single unknown is known everywhere between its points, up to jumps: the weights of the points are the density
+times their spacing, and proposals are fitted to the density of interpolated predictions, which finds the posterior in fewer
+rounds.
 """
 
 import math
@@ -63,9 +67,8 @@ def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.n
 #: Degrees of freedom of the components: tails heavier than those of a posterior, and a finite covariance.
 FREEDOM = 5.0
 
-#: Number of nodes of each component for draws of a single unknown; they are equally spaced in the logit of the probability,
-#: from -`TAIL` to `TAIL`.
-NODES, TAIL = 201, 12.0
+#: Of so many draws of a single unknown, in order, the middle one is kept.
+THINNED = 64
 
 #: Iterations of expectation maximisation, and the fraction of the whole covariance that is added to each component's.
 ITERATIONS, SHRINKAGE = 15, 1e-3
@@ -84,20 +87,15 @@ class Mixture(NamedTuple):
     roots: Float[np.ndarray, "components unknowns unknowns"]
 
     def draw(self, count: int, random: np.random.Generator) -> Float[np.ndarray, "count unknowns"]:
-        """Draws: with a single unknown, one from each of `count` intervals of equal probability; otherwise independent ones,
-        of which each component gets its share, rounded at random."""
-        if self.centres.shape[1] == 1:
-            from scipy.special import expit, stdtr, stdtrit
-
-            shares = np.linspace(-TAIL, TAIL, NODES)
-            places = np.sort(np.ravel(self.centres + self.roots[:, 0] * stdtrit(FREEDOM, expit(shares))))
-            cumulative = self.shares @ stdtr(FREEDOM, (places - self.centres) / self.roots[:, 0])
-            return np.interp((np.arange(count) + random.uniform(size=count)) / count, cumulative, places)[:, None]
-        steps = (np.arange(count) + random.uniform()) / count
+        """Draws, of which each component gets its share, rounded at random; with a single unknown, one from each of `count`
+        intervals of nearly equal probability."""
+        every = THINNED if self.centres.shape[1] == 1 else 1
+        steps = (np.arange(every * count) + random.uniform()) / (every * count)
         which = np.minimum(np.searchsorted(np.cumsum(self.shares), steps), len(self.shares) - 1)
-        normal = random.normal(size=(count, self.centres.shape[1]))
-        stretch = np.sqrt(FREEDOM / random.chisquare(FREEDOM, count))
-        return self.centres[which] + np.einsum("nij,nj->ni", self.roots[which], normal) * stretch[:, None]
+        normal = random.normal(size=(every * count, self.centres.shape[1]))
+        stretch = np.sqrt(FREEDOM / random.chisquare(FREEDOM, every * count))
+        draws = self.centres[which] + np.einsum("nij,nj->ni", self.roots[which], normal) * stretch[:, None]
+        return draws if every == 1 else np.sort(draws, axis=0)[every // 2 :: every]
 
     def log_density(self, points: Points) -> PerPoint:
         """The log density of the mixture."""
@@ -281,9 +279,8 @@ ENOUGH, MOST_K, ROUNDS = 400.0, 0.7, 40
 #: with a single unknown, to half of the first number.
 TEMPERED, LEAST_TEMPERED = 20.0, 80.0
 
-#: A draw from one of many intervals of equal probability is worth at most so many independent ones: the ends of an interval of
-#: 95 % are then as accurate or better.
-EVEN = 6.0
+#: A point of a single unknown is worth at most so many independent draws: the ends of intervals are then as accurate or better.
+EVEN = 10.0
 
 #: Number of groups of measurements, in the order of their times, and the number of groups whose powers grow together.
 GROUPS, FRONT = 32, 8
@@ -305,11 +302,12 @@ POWERS = (1.0, 0.4)
 class Pool(NamedTuple):
     """All points so far, a weighted sample of the posterior.
 
-    - `points`: (n, unknowns), coordinates; `predictions`: (n, measurements).
+    - `points`: (n, unknowns), coordinates, in order if there is a single unknown; `predictions`: (n, measurements).
     - `groups`: (n, groups), log likelihoods of groups of measurements; `log_prior`, `log_density`: (n,), of the posterior,
       averaged over unknown errors.
     - `log_region`: (n,), 0 in the region of the search, and less outside of it.
-    - `log_proposal`: (n,), log of the density from which all points together were drawn, times n.
+    - `log_proposal`: (n,), log of the density of the points: of that from which all were drawn, times n; with a single
+      unknown, of the inverse of their spacing.
     - `proposals`: pairs of a number of points and the distribution from which they were drawn.
     - `weights`: (n,), Pareto-smoothed, with the sum 1; `k`: shape of the weights' tail; `effective`: the effective number of
       draws.
@@ -354,7 +352,7 @@ class Pool(NamedTuple):
 class Explorer(NamedTuple):
     """What is explored, and where: a density, the region of the search, and the group of every measurement.
 
-    `rows`: number of points in a round: with a single unknown, whose draws are spread evenly, few are enough.
+    `rows`: number of points in a round: with a single unknown, whose points fill the posterior evenly, few are enough.
     """
 
     density: LogDensity
@@ -408,17 +406,15 @@ class Explorer(NamedTuple):
 
     def extended(self, pool: Pool, points: Points, proposal: Region | Mixture) -> Pool:
         """The pool with points that were drawn from a proposal."""
-        predictions, each, prior, log_density = self.evaluated(points)
-        groups = np.stack([np.sum(each[:, self.group == k], axis=1) for k in range(pool.groups.shape[1])], axis=1)
         proposals = (*pool.proposals, (len(points), proposal))
+        grown = [np.concatenate(pair) for pair in zip(pool[:6], self.compared(points), strict=True)]
         old = np.logaddexp(pool.log_proposal, math.log(len(points)) + proposal.log_density(pool.points))
         new = np.logaddexp.reduce([math.log(n) + other.log_density(points) for n, other in proposals], axis=0)
-        # 0 in the region; outside, less with the square of the distance.
-        beyond = (np.abs(points - self.region.middle) / self.region.half_width - 1.0).clip(0.0)
-        log_region = -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
-        parts = (points, predictions, groups, prior, log_density, log_region)
-        grown = (np.concatenate(pair) for pair in zip(pool[:6], parts, strict=True))
-        pool = Pool(*grown, log_proposal=np.concatenate([old, new]), proposals=proposals)
+        log_proposal = np.concatenate([old, new])
+        if points.shape[1] == 1:
+            grown = [part[np.argsort(grown[0][:, 0])] for part in grown]
+            log_proposal = -np.log(np.gradient(grown[0][:, 0]))
+        pool = Pool(*grown, log_proposal=log_proposal, proposals=proposals)
         logs = pool.log_weights(2.0)
         weights, k = smoothed_weights(np.where(np.isfinite(logs), logs, -np.inf))
         return pool._replace(weights=weights, k=k, effective=independent_number(pool.points, weights))
@@ -447,22 +443,28 @@ class Explorer(NamedTuple):
         """The mixture that fits the points so far best; the components around known minima get a share of it."""
         size = pool.points.shape[1]
         least = max(LEAST_TEMPERED, TEMPERED * size) if size > 1 else 0.5 * TEMPERED
+        if size == 1:
+            # The points, and more between them, with interpolated predictions.
+            place, known = np.linspace(0.0, len(pool.points) - 1.0, ROWS), np.concatenate(pool[:2], axis=1)
+            between = np.stack([np.interp(place, np.arange(len(known)), column) for column in known.T], axis=1)
+            parts = self.compared(between[:, :1], between[:, 1:])
+            pool = Pool(*parts, log_proposal=-np.log(np.gradient(between[:, 0])), proposals=())
         halves = [
             fitted(pool.points, tempered_weights(pool, least, power), COMPONENTS, self.random) for power in POWERS
         ]
         mixture = halves[0].joined(halves[1], 0.5)
         return mixture if minima is None else mixture.joined(minima, share)
 
-    def evaluated(self, points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Predictions, log likelihoods of all measurements, log priors and log densities of at most `ROWS` points.
+    def compared(self, points: Points, known: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+        """The first fields of a pool, for at most `ROWS` points, whose predictions may be known.
 
         The likelihood of a measurement is that with its stated or guessed error; the density is averaged over unknown errors.
         """
         inside = self.region.contains(points)
         # Rows of NaN take no time. The program of the priors is compiled for `ROWS` rows.
-        batch = np.full((ROWS, points.shape[1]), np.nan)
-        batch[: len(points)][inside] = points[inside]
-        measurements, predictions = self.density.measurements, self.density.predict(batch[: len(points)])
+        batch = np.pad(np.where(inside[:, None], points, np.nan), ((0, ROWS - len(points)), (0, 0)))
+        measurements = self.density.measurements
+        predictions = np.asarray(self.density.predict(batch[: len(points)])) if known is None else known
         residual = compared(measurements, predictions)[0]
         each, estimated = -0.5 * residual**2, np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
         likelihood = np.sum(each[:, ~estimated], axis=1)
@@ -470,21 +472,26 @@ class Explorer(NamedTuple):
             likelihood = likelihood + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])
         prior = np.asarray(self.density.problem.unknowns.log_priors(batch))
         prior = np.where(inside, prior[: len(points)], -np.inf)
-        return predictions, each, prior, likelihood + prior
+        groups = np.stack([np.sum(each[:, self.group == k], axis=1) for k in np.unique(self.group)], axis=1)
+        # 0 in the region; outside, less with the square of the distance.
+        beyond = (np.abs(points - self.region.middle) / self.region.half_width - 1.0).clip(0.0)
+        log_region = -0.5 * np.sum((beyond / EDGE) ** 2, axis=1)
+        return points, predictions, groups, prior, likelihood + prior, log_region
 
 
 def independent_number(points: Points, weights: PerPoint) -> float:
     """Number of independent draws that are worth as much as weighted points (Kish).
 
-    The points of a single unknown are spread evenly, so that chance is left only in the differences of neighbouring weights
-    (Wolter, "An investigation of some estimators of variance for systematic sampling", J. Am. Stat. Assoc. 79 (1984) 781);
-    half of that number, because jumps of the weights, as on a staircase, are not independent.
+    The weights of a single unknown, whose points are in order, are the density times the spacing, so only the course of the
+    density between neighbours is unknown. A jump anywhere between them leaves an error of their masses whose standard deviation
+    is the jump times their distance / sqrt(12); the probability of an interval in n independent draws has one of at most
+    1 / sqrt(4 n).
     """
     number = float(1.0 / np.sum(weights**2))
     if points.shape[1] > 1:
         return number
-    differences = np.diff(weights[np.argsort(points[:, 0])])
-    return max(number, min(EVEN * number, 1.0 / max(float(np.sum(differences**2)), 1e-300)))
+    jumps = np.diff(weights / np.gradient(points[:, 0])) * np.diff(points[:, 0])
+    return max(number, min(EVEN * number, 3.0 / max(float(np.sum(jumps**2)), 1e-300)))
 
 
 def tempered_weights(pool: Pool, least: float, power: float) -> PerPoint:
@@ -499,10 +506,9 @@ def tempered_weights(pool: Pool, least: float, power: float) -> PerPoint:
         weights = weights / np.sum(weights)
         return weights, bool(1.0 / np.sum(weights**2) >= least)
 
-    (weights, is_enough), low, high = weights_at(2.0), 0.0, 2.0
-    if is_enough:
-        return weights
-    for _ in range(30):
+    # At first at the end of the way, 2; beyond, nothing changes.
+    low, high = 0.0, 4.0
+    for _ in range(31):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if weights_at(middle)[1] else (low, middle)
     return weights_at(low)[0]

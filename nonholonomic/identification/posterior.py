@@ -486,8 +486,7 @@ class Linearised(NamedTuple):
     @property
     def deviance(self) -> Float[np.ndarray, " rows"]:
         """-2 log posterior of every row, up to a constant; infinite where the model failed."""
-        of_data, of_priors = np.split(self.residual, [self.prediction.shape[1]], axis=1)
-        deviance = np.sum(of_data**2, axis=1) + np.sum(of_priors**2, axis=1)
+        deviance = np.sum(self.residual**2, axis=1)
         return np.where(np.isfinite(deviance), deviance, np.inf)
 
 
@@ -578,9 +577,7 @@ def deviances(
     density: "LogDensity", coordinates: Rows, prediction: Float[np.ndarray, "rows n"]
 ) -> Float[np.ndarray, " rows"]:
     """-2 log posterior in every row, up to a constant, from the predictions of the rows."""
-    residual = compared(density.measurements, prediction)[0]
-    prior = np.asarray(density.problem.unknowns.prior_residuals(jnp.asarray(coordinates, float))[0])
-    return np.sum(residual**2, axis=1) + np.sum(prior**2, axis=1)
+    return weighed(density, coordinates, prediction, np.zeros((*prediction.shape, coordinates.shape[1]))).deviance
 
 
 def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]) -> list[np.ndarray]:

@@ -340,8 +340,6 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
     combinations = identifiability(ends.density, likely, slopes, linearised.information[best, :count])
     # Where the weights hold, a search by slopes that got stuck on a stair, or ended early, does not matter.
     status = "converged" if distribution.kind in ("weights", "linear") else statuses[best]
-    with np.errstate(invalid="ignore"):
-        slope_covariance = np.where(by_slopes == 0.0, 0.0, by_slopes * np.outer(slopes, slopes))
 
     def by_name(numbers: Sequence[Any] | np.ndarray) -> dict[str, Any]:
         return ByName(zip(problem.names, numbers, strict=True))
@@ -351,7 +349,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         standard_errors=by_name(np.sqrt(np.diag(covariance)).tolist()),
         covariance=covariance,
         most_likely=by_name(likely.tolist()),
-        slope_errors=by_name(np.sqrt(np.diag(slope_covariance)).tolist()),
+        slope_errors=by_name((np.abs(slopes) * np.sqrt(np.diag(by_slopes))).tolist()),
         deviance=float(deviances[best]),
         degrees=linearised.residual.shape[1] - len(likely),
         identifiability=combinations,
@@ -644,8 +642,8 @@ def drawn(
     start = np.asarray(density.start)[None, : len(density.problem.names)]
     points = np.concatenate([first, proposal.draw(chains * steps, random)])
     every = np.concatenate([points, start])
-    parts = [explorer.evaluated(every[first : first + ROWS]) for first in range(0, len(every), ROWS)]
-    predictions, log_density = (np.concatenate([part[k] for part in parts]) for k in (0, 3))
+    parts = [explorer.compared(every[first : first + ROWS]) for first in range(0, len(every), ROWS)]
+    predictions, log_density = (np.concatenate([part[k] for part in parts]) for k in (1, 4))
     order = random.permutation(np.arange(chains, len(points))).reshape(steps, chains)
     # The chains begin at the first points; the index of the point of every chain after each step.
     state, path, accepted = np.arange(chains), np.empty(order.shape, int), 0.0

@@ -439,8 +439,7 @@ def search(explorer: Explorer, starts: int, max_steps: int, progress: bool) -> t
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
     # Whether there is a single unknown, and the density falls towards both ends of its range.
-    ends = pool.log_density[np.argsort(pool.points[:, 0])][[0, -1]]
-    is_bounded = len(problem.names) == 1 and bool(np.all(ends < np.max(pool.log_density) - FALL))
+    is_bounded = len(problem.names) == 1 and bool(np.all(pool.log_density[[0, -1]] < np.max(pool.log_density) - FALL))
     if problem.step is not None and (recorded or is_bounded):
         # A step by differences takes as long as a round of the exploration, which also finds the minima.
         sample = explorer.explore(pool, None, progress)
@@ -448,11 +447,12 @@ def search(explorer: Explorer, starts: int, max_steps: int, progress: bool) -> t
         # Among so many points of a single unknown, the best is close to the minimum.
         steps = min(steps, 1) if sample.enough and not recorded else steps
         return explorer, refine(density, best, steps, progress), sample
-    # The first point; then, in turn, the best for all measurements and for the early ones.
+    # The start; then, in turn, the best for all measurements and for the early ones.
+    start = int(np.argmin(np.sum((pool.points - explorer.region.middle) ** 2, axis=1)))
     totals = np.cumsum(pool.groups, axis=1) + pool.log_prior[:, None]
     columns = sorted({totals.shape[1] - 1, *(totals.shape[1] * part // 8 for part in (0, 1, 2, 4))}, reverse=True)
     ranked = np.stack([np.argsort(-totals[:, column]) for column in columns], axis=1).reshape(-1)
-    candidates = pool.points[list(dict.fromkeys([0, *ranked.tolist()]))[:starts]]
+    candidates = pool.points[list(dict.fromkeys([start, *ranked.tolist()]))[:starts]]
     minima = refine(density, candidates, steps, progress, in_parts=recorded)
     if recorded:
         later = refine(minima.density, minima.between(), min(max_steps, BETWEEN), progress)
