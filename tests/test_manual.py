@@ -35,6 +35,15 @@ def test_the_gallery_has_a_card_with_a_thumbnail_for_every_picture():
     assert sorted(names) == sorted(path.stem for path in (DOCS / "gallery").glob("*.webp"))
 
 
+def test_every_tutorial_has_a_picture():
+    pages = [page for page in (DOCS / "tutorials").glob("*.md") if page.stem != "index"]
+    pictures = {page.stem: re.findall(r"^!\[.+\]\((.+\.webp)\)$", page.read_text(), re.M) for page in pages}
+    assert len(pictures) >= 12
+    assert [
+        name for name, paths in pictures.items() if not any((DOCS / "tutorials" / path).exists() for path in paths)
+    ] == []
+
+
 def test_every_section_of_a_derivation_that_a_docstring_cites_exists():
     """The manual links "`tippe.md`, section 3" to the heading with that number."""
     cited = {

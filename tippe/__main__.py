@@ -157,7 +157,8 @@ def sliders(options: argparse.Namespace) -> str:
     """The page of the top with sliders, with a placeholder for the contents below."""
     model = TopModel(scene=scene(options, "plane"), launch=launch_shown(options))
     t1 = min(SHOWN, options.t1)
-    return live_page(page_of_launch(model, None, t1)._replace(title=TITLE), stage_at_start(model, t1), 0.2, BELOW).html
+    live = page_of_launch(model, None, t1)._replace(title=TITLE)
+    return live_page(live, stage_at_start(model, t1), 0.2, BELOW, ("deg", "rpm")).html
 
 
 def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], list[Path], str]:
@@ -237,7 +238,7 @@ def picture(options: argparse.Namespace, times: Times, theta: Times, plane: Tabl
     dot = "The dot is the first time above the dashed angle."
     if TOPS[options.top]().stem is not None:
         dot = "The dot is the time at which the stem first carries the top. On the dashed line, sphere and stem touch together."
-    return draw_launches([panel], angle, dot if end <= times[-1] else f"Not turned over by {times[-1]:g} s.")
+    return draw_launches([panel], angle, dot if end <= times[-1] else f"Not turned over by {times[-1]:g} s.", "deg")
 
 
 def write(options: argparse.Namespace) -> views.Outputs:

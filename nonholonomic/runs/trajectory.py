@@ -28,7 +28,7 @@ from ..validation import IN_DEGREES, explaining, is_traced, require_all, require
 from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stages_of
 from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
 from ..views.pages import require_labels
-from ..views.stage import Draw, Drawing, Parts, Wheel, curves_in, meshes_of, of_grid
+from ..views.stage import Draw, Drawing, Parts, Wheel, meshes_of, of_grid
 from .model import AbstractModel, Names, Sliders, model_of, run_of
 
 # A page with sliders that simulates any model in the browser.
@@ -71,7 +71,7 @@ def explore(
     - `sliders`: name of a parameter -> (lowest, highest) value; the end of a name is enough if only one parameter
       matches.
     - `t1`: horizon [s].
-    - `unit`: unit of the curves, such as "deg" for all angles, or several, such as ("deg", "cm").
+    - `unit`: unit of the curves and of the sliders, such as "deg" for all angles, or several, such as ("deg", "cm").
     - `draw`: for your own system, as for `Trajectory.view`; a slider moves the parts, but cannot change their size.
     - `label`: title of the page.
 
@@ -124,8 +124,8 @@ def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: 
     require_unit(unit)
     model.check()
     live, stage = page_of(model, sliders, t1)
-    (stage,) = curves_in([stage], unit or unit_of(model))
-    html_page = live_page(live if label is None else live._replace(title=require_labels([label], [model])[0]), stage)
+    live = live if label is None else live._replace(title=require_labels([label], [model])[0])
+    html_page = live_page(live, stage, unit=unit or unit_of(model))
     if path is not None:
         html_page.save(path)
     return html_page
@@ -271,20 +271,24 @@ def live_run(
 # Pictures of a user's system: what its function `draw` returns, or a point in the plane of two components; and curves.
 
 #: Half the longer side of the plane in which a point is drawn, the radius of the point, and its size for the camera [m].
-HALF, RADIUS, SIZE = 1.0, 0.04, 0.4
+HALF, RADIUS, SIZE = 1.0, 0.05, 0.4
 
-#: Components whose spans have at most this ratio have the same scale, as the coordinates of a path.
-EQUAL = 4.0
+#: Components whose spans have at most this ratio have one scale, as the coordinates of a path; the ratio for components named
+#: x, y or z. A second component that differs from the rate of the first by less than this part of its span has its own scale.
+EQUAL, EQUAL_PLACES, RATE = 4.0, 20.0, 0.1
 
 #: In units of the size of a drawing: the width of lines and traces, and the ground around it. The height of the camera in units
 #: of its distance along the ground.
 WIDTH, MARGIN, RISE = 0.03, 0.3, 0.7
 
 
-def drawing_of(model: Any, states: list[np.ndarray]) -> tuple[Drawing, str, str, tuple[tuple[str, float, float], ...]]:
+def drawing_of(
+    model: Any, t: np.ndarray, states: list[np.ndarray]
+) -> tuple[Drawing, str, str, tuple[tuple[str, float, float], ...]]:
     """The function that draws the states of a model, the title, the name of the path, and the axes of the `Arena`.
 
     By default, a state is a point in the plane of its first two components, or on a line if it has one component.
+    **Arguments:** `t`: the times of the first of the `states`.
     """
     if model.draw:
         return model.draw, model.title, "path", (("x [m]", 0.0, 1.0), ("y [m]", 0.0, 1.0))
@@ -292,13 +296,17 @@ def drawing_of(model: Any, states: list[np.ndarray]) -> tuple[Drawing, str, str,
     low, span = points.min(axis=0), np.ptp(points, axis=0)
     centre = low + 0.5 * span
     span = np.where(span > 0.0, span, np.max(span) or 1.0)
-    scale = 2.0 * HALF / (np.full(2, np.max(span)) if np.max(span) < EQUAL * np.min(span) else span)
+    names, (first, second) = model.names[:2], points[: len(t)].T
+    with np.errstate(all="ignore"):
+        error = np.nanmedian(np.abs(np.gradient(first, t) - second)) if len(t) > 1 else np.inf
+    equal = 0.0 if error < RATE * np.ptp(second) else EQUAL_PLACES if set(names) <= set("xyz") else EQUAL
+    scale = 2.0 * HALF / (np.full(2, np.max(span)) if np.max(span) < equal * np.min(span) else span)
 
     def draw(system: object, t: Array, y: Array) -> list[Ball]:
         x, y = ((part - middle) * by for part, middle, by in zip((*y, 0.0), centre, scale, strict=False))
         return [Ball((x, y, RADIUS), RADIUS)]
 
-    names, path = model.names[:2], " over ".join(model.names[1::-1])
+    path = " over ".join(names[::-1])
     return draw, f"{model.title}: {path}", path, tuple(zip(names, centre.tolist(), scale.tolist(), strict=False))
 
 
@@ -375,7 +383,7 @@ def stage_of(numbers: Sequence[int], runs: list["Trajectory"]) -> tuple[Drawing,
         if not np.any(is_reached):
             raise ValueError(f"a picture needs a finite state, but the run, with status {run.status!r}, has none")
         reached.append((np.asarray(run.t)[is_reached], np.asarray(run.state)[is_reached]))
-    draw, title, path, axes = drawing_of(models[0], [state for _, state in reached])
+    draw, title, path, axes = drawing_of(models[0], reached[0][0], [state for _, state in reached])
     size, corners, drawn = 0.0 if models[0].draw else SIZE, [], []
     for model, (t, state) in zip(models, reached, strict=True):
         draw_state = functools.partial(frame_of, draw, model.parameters.tree["system"])
@@ -393,7 +401,7 @@ def stage_of(numbers: Sequence[int], runs: list["Trajectory"]) -> tuple[Drawing,
     arena = Arena(views.Mesh(ground, of_grid(2, 2)[:, ::-1], PALE), (), "", np.array([0.0, 0.0, 1.0]), axes)
     shown_runs = zip(numbers, models, drawn, strict=False)
     shows = tuple(show_of(number, path, model.names, size, of_run) for number, model, of_run in shown_runs)
-    return draw, Stage(title, arena, shows, rise=RISE)
+    return draw, Stage(title, arena, shows, rise=RISE if models[0].draw else 2.0 * RISE)
 
 
 # One run of a user's system at given times.

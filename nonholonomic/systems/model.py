@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -77,7 +78,9 @@ class OwnModel(AbstractModel):
 
     def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
         require_apart("axes and sensitivities", names)
-        return {name: (short, "1", "") for name, short in short_names(names).items()}
+        starts = (name for name in self.parameters.names if name.startswith("start"))
+        texts = {name: f"{component} at the start" for name, component in zip(starts, self.names, strict=False)}
+        return {name: (short, "1", texts.get(name, "")) for name, short in short_names(names).items()}
 
     def description(self) -> dict[str, Any]:
         tree = self.parameters.tree
@@ -359,12 +362,14 @@ DEFAULT_SLIDERS, TURNS = 3, 40.0
 @page_of.register(OwnModel)
 def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) -> tuple[LiveRun, Stage]:
     """The page of a model: its run, and the plane on which it is drawn. By default, the first parameters that are not zero
-    have sliders, from half to twice their values."""
+    have sliders, from half to twice their values, and then components of the start, if the ends of their sliders allow runs."""
     if ranges is None:
-        names = [name for name in model.known if "[*]" not in name and float(model.value(name))]
-        names.sort(key=lambda name: name.startswith("start"))
-        values = {name: float(model.value(name)) for name in names[:DEFAULT_SLIDERS]}
-        ranges = {name: tuple(sorted((0.5 * value, 2.0 * value))) for name, value in values.items()}
+        values = {name: float(model.value(name)) for name in model.known if "[*]" not in name}
+        ends = {name: tuple(sorted((0.5 * value, 2.0 * value))) for name, value in values.items() if value}
+        ends |= {name: (-1.0, 1.0) for name in values if name.startswith("start") and name not in ends}
+        names = sorted(ends, key=lambda name: name.startswith("start"))
+        legal = (name for name in names if all(np.all(model.replaced({name: end}).legal()) for end in ends[name]))
+        ranges = {name: ends[name] for name in [*itertools.islice(legal, DEFAULT_SLIDERS)] or names[:DEFAULT_SLIDERS]}
     sliders = sliders_of(model, ranges)
     names, (draw, stage) = model.names, stage_of([0], runs_at_ends(model, sliders, t1))
 

@@ -1,7 +1,6 @@
 """Pictures, films and pages of results. The subpackages above compute the results, and use these functions to draw
 them."""
 
-from .pages import NO_VIEW as NO_VIEW
 from .pages import Outputs as Outputs
 from .pages import Page as Page
 from .pages import Viewable as Viewable
@@ -14,7 +13,6 @@ from .pages import stages_of as stages_of
 from .pages import table_as_html as table_as_html
 from .pages import without_motion as without_motion
 from .plot import draw_fit as draw_fit
-from .plot import new_figure as new_figure
 from .stage import COLOURS as COLOURS
 from .stage import DARK as DARK
 from .stage import PALE as PALE
@@ -36,8 +34,6 @@ from .stage import arena as arena
 from .stage import ball as ball
 from .stage import bar as bar
 from .stage import box as box
-from .stage import css as css
-from .stage import distinguished_by_colour as distinguished_by_colour
 from .stage import rod as rod
 from .stage import striped as striped
 from .stage import turned as turned

@@ -9,11 +9,12 @@
   let values = [...initial], player = null, median = [];
 
   const digits = (number, count = 4) => !Number.isFinite(number) ? "–" : number === 0 ? "0"
-    : Math.abs(number) < 1e-3 || Math.abs(number) >= 1e5 ? number.toExponential(count - 1) : number.toPrecision(count);
-  // A value with its unit, and in degrees or revolutions per minute.
-  function withUnit(value, { name, unit }) {
-    const other = unit === "rad" ? `${digits((180 * value) / Math.PI, 3)}°` : name.endsWith("spin") ? `${Math.round((30 * value) / Math.PI)} rpm` : "";
-    return `${digits(value, 3)} ${unit}${other && ` = ${other}`}`;
+    : Math.abs(number) < 1e-3 || Math.abs(number) >= 1e5 ? number.toExponential(count - 1)
+      : Math.abs(number) >= 10 ** count ? String(Math.round(number)) : number.toPrecision(count);
+  // A value in the unit of the page, and in degrees or revolutions per minute if that is the SI unit.
+  function withUnit(value, { name, unit, factor }) {
+    const other = unit === "rad" ? `${digits((180 * value) / Math.PI, 3)}°` : unit === "rad/s" && name.endsWith("spin") ? `${Math.round((30 * value) / Math.PI)} rpm` : "";
+    return `${digits(factor * value, 3)} ${unit}${other && ` = ${other}`}`;
   }
   const knobs = sliders.map((slider, k) => {
     const label = element("label", document.getElementById("knobs")), title = element("span", label, { textContent: slider.label });
@@ -57,8 +58,8 @@
     element("strong", result, { textContent: Number.isFinite(found) ? `${digits(found)} ${facts.answer.unit}` : word });
     element("span", result, { className: "word", textContent: Number.isFinite(found) ? word : "\u00a0" });
     const list = element("dl", result), entry = (kind, ...texts) => element(kind, list).append(...texts);
-    for (const { label, unit, curve } of facts.summaries) {
-      const all = run.curves[curve].values, [begin, end] = [all[0], all[all.length - 1]];
+    for (const { label, unit, factor, curve } of facts.summaries) {
+      const all = run.curves[curve].values.map((value) => factor * value), [begin, end] = [all[0], all[all.length - 1]];
       const drift = Math.max(...all.map((one) => Math.abs(one - begin))) / Math.abs(begin);
       entry("dt", label);
       if (drift < 1e-5) { entry("dd", `${digits(begin)} ${unit}`); entry("dt"); entry("dd", `constant to ${drift.toExponential(0)}`); continue; }

@@ -25,8 +25,9 @@ from ..integration.problem import LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ..integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
 from ..integration.scheduler import LaneScheduler, back_to_margin, outcome_of, with_crossing_times
 from ..integration.step import Control, after_step, length_to_try, looks_of
+from ..text import Unit
 from .pages import Page, page, script, template
-from .stage import Stage
+from .stage import Stage, converted, curves_in
 
 # Convert a function that JAX can trace to a JavaScript function of the same numbers.
 #
@@ -611,7 +612,8 @@ class Simulator(NamedTuple):
 
 
 class Slider(NamedTuple):
-    """A slider: its `name` in the page's address, the `path` of its parameter, a `label`, its unit, its range and its value."""
+    """A slider: its `name` in the page's address, the `path` of its parameter, a `label`, its range and its value in the SI
+    unit, the unit in which the page shows it, and the factor that converts to this unit."""
 
     name: str
     path: str
@@ -620,6 +622,7 @@ class Slider(NamedTuple):
     low: float
     high: float
     value: float
+    factor: float = 1.0
 
 
 class Summary(NamedTuple):
@@ -628,6 +631,7 @@ class Summary(NamedTuple):
     label: str
     unit: str
     curve: int
+    factor: float = 1.0
 
 
 class LiveRun(NamedTuple):
@@ -653,19 +657,23 @@ class LiveRun(NamedTuple):
     summaries: tuple[Summary, ...]
 
 
-def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") -> Page:
+def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "", unit: Unit = None) -> Page:
     """The page of a run with sliders.
 
-    **Arguments:** `stage`: a stage with one run, for its arena, meshes and names; `speed`, `below`: as for `page`.
+    **Arguments:** `stage`: a stage with one run, for its arena, meshes and names; `speed`, `below`: as for `page`; `unit`: that
+    of curves, arrows, sliders and summaries, as for `in_unit`.
 
     **Raises:** `ModuleNotFoundError` if the library for views is not installed; `ValueError` for equations that cannot be
     written in JavaScript.
     """
     # The title and the warnings describe one run, but the sliders change the run.
     stage_of_live = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
+    sliders = tuple(slider._replace(**converted(slider.unit, unit)) for slider in live.sliders)
+    summaries = tuple(summary._replace(**converted(summary.unit, unit)) for summary in live.summaries)
+    live = live._replace(sliders=sliders, summaries=summaries)
     scripts = [script(text) for text in (programs(live), template("map.js"), template("explore.js"))]
     section = f'<section id="below">{below}</section>'
-    return page([stage_of_live], live.title, speed, template("explore.html"), section, scripts=scripts)
+    return page(curves_in([stage_of_live], unit), live.title, speed, template("explore.html"), section, scripts=scripts)
 
 
 def programs(live: LiveRun) -> str:

@@ -42,7 +42,7 @@ window.views = window.views || {};
         range.selectNodeContents(texts.currentNode);
         const holder = texts.currentNode.parentElement, style = getComputedStyle(holder), [x, y, wide, high] = at(size(range));
         if (!wide || holder.closest(`.buttons, ${FOLDED}`)) continue;
-        if (holder.matches(".name")) { pen.fillStyle = style.backgroundColor; pen.fillRect(...at(size(holder))); }
+        if (holder.matches(".name, .force")) { pen.fillStyle = style.backgroundColor; pen.fillRect(...at(size(holder))); }
         Object.assign(pen, { fillStyle: style.color, font: `${style.fontWeight} ${style.fontSize} ${style.fontFamily}` });
         pen.fillText(texts.currentNode.data, x, y + high / 2, wide);
       }

@@ -29,7 +29,7 @@ function makeMap(box, live, integrator, choose) {
   const program = `${integrator}
     const work = integrator(${text(live.answer)}), allowed = ${live.allowed};
     onmessage = ({ data: { round, first, runs } }) => postMessage({ round, first, found: runs.map((values) =>
-      allowed(values, [])[0] ? (work.run(values), work.read("outcome", values)) : [-1, Infinity]) });`;
+      allowed(values, [])[0] ? (work.run(values), work.read("outcome", values)) : [null, Infinity]) });`;
   const workers = [];
   try {
     const address = URL.createObjectURL(new Blob([program], { type: "text/javascript" }));
@@ -71,6 +71,16 @@ function makeMap(box, live, integrator, choose) {
     requestAnimationFrame(() => { drawing = false; draw(); });
   }
   const left = 48, bottom = 38;
+  // Lines at 45 degrees over a part of the map whose runs have no number, so that no colour of a number looks alike.
+  function hatch(pen, x, y, w, h) {
+    pen.save();
+    pen.beginPath(); pen.rect(x, y, w, h); pen.clip();
+    Object.assign(pen, { strokeStyle: "#6b7280", lineWidth: 1 });
+    pen.beginPath();
+    for (let at = 6 * Math.ceil((x - y - h) / 6); at < x + w - y; at += 6) { pen.moveTo(at + y, y); pen.lineTo(at + y + h, y + h); }
+    pen.stroke();
+    pen.restore();
+  }
   function draw() {
     const ratio = window.devicePixelRatio || 1, [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width) return;
@@ -90,14 +100,16 @@ function makeMap(box, live, integrator, choose) {
       const [x0, x1] = [cell.x, Math.min(across, cell.x + cell.level)].map((x) => Math.round(left + (x / across) * w));
       const [y0, y1] = [cell.y, Math.min(up, cell.y + cell.level)].map((y) => Math.round(2 + h - (y / up) * h));
       pen.fillRect(x0, y1, x1 - x0, y0 - y1);
+      if (!Number.isFinite(value)) hatch(pen, x0, y1, x1 - x0, y0 - y1);
     });
     const [first, second] = axes.map((k) => sliders[k]);
     pen.fillStyle = "#23262b";
     pen.font = "13px system-ui, sans-serif";
     const label = (one) => one.label + (one.unit ? ` [${one.unit}]` : "");
-    pen.textAlign = "left"; pen.fillText(short(first.low), left, height - 22);
-    pen.textAlign = "right"; pen.fillText(short(first.high), left + w, height - 22);
-    pen.fillText(short(second.high), left - 5, 11); pen.fillText(short(second.low), left - 5, 2 + h);
+    const [ends, sides] = [first, second].map(({ low, high, factor }) => [low, high].map((end) => short(factor * end)));
+    pen.textAlign = "left"; pen.fillText(ends[0], left, height - 22);
+    pen.textAlign = "right"; pen.fillText(ends[1], left + w, height - 22);
+    pen.fillText(sides[1], left - 5, 11); pen.fillText(sides[0], left - 5, 2 + h);
     pen.textAlign = "center"; pen.fillText(label(first), left + w / 2, height - 5);
     pen.save(); pen.translate(11, 2 + h / 2); pen.rotate(-Math.PI / 2); pen.fillText(label(second), 0, 0); pen.restore();
     const x = left + ((values[axes[0]] - first.low) / (first.high - first.low)) * w;
@@ -118,9 +130,11 @@ function makeMap(box, live, integrator, choose) {
       legend.append(entry(answer.label), entry(short(low), scale, `${short(high)}\u00a0${answer.unit}`));
     }
     for (const status of new Set(known.filter((one) => !Number.isFinite(one[1])).map((one) => one[0]))) {
-      const word = words[status] || "illegal", box = document.createElement("i");
-      Object.assign(box.style, { background: colours[word] || "#fff", border: "1px solid #dde1e6" });
-      legend.append(entry(box, word.replace(/_/g, " ")));
+      const word = words[status] || "illegal", box = Object.assign(document.createElement("canvas"), { width: 13, height: 13 }), pen = box.getContext("2d");
+      pen.fillStyle = colours[word] || "#ffffff";
+      pen.fillRect(0, 0, 13, 13);
+      hatch(pen, 0, 0, 13, 13);
+      legend.append(entry(box, word === "illegal" ? "not possible" : word.replace(/_/g, " ")));
     }
   }
 

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -30,7 +30,15 @@ from jaxtyping import ArrayLike, Float
 from ..terminal import status_line
 from ..text import Unit, require_unit, shown, unit_of
 from ..validation import replacing, require, require_file, require_increasing, require_package
+from .plot import legend_above, new_figure
 from .stage import Arrow, Body, Curve, Draw, Marks, Mesh, Show, Stage, Trace, css, curves_in, finite
+
+# Only for type checkers: matplotlib is optional.
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Relative range of values below which a panel of curves draws them as constant.
+LEAST_RANGE = 1e-3
 
 #: Selectable speeds of time.
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -45,9 +53,6 @@ SCRIPTS = ("stage.js", "strips.js", "film.js", "player.js")
 
 #: The name of a run, or a list of one for each run; `None` for names that say what differs.
 Label = str | Sequence[str] | None
-
-#: Opening angle of the camera [deg].
-ANGLE = 35.0
 
 
 class Page(NamedTuple):
@@ -69,11 +74,6 @@ class Page(NamedTuple):
 
     def __repr__(self) -> str:
         return f"Page of {len(self.html) / 1e6:.2f} MB; save(path) writes it, and a notebook shows it"
-
-
-def can_view() -> bool:
-    """Whether three.js is installed."""
-    return find_spec(PACKAGE) is not None
 
 
 def page(
@@ -101,7 +101,7 @@ def page(
     """
     parts = {"TITLE": html.escape(title), "HEIGHT": str(height), "ABOVE": above, "BELOW": below, "VIEW": ""}
     if stages:
-        if not can_view():
+        if without_motion():
             raise ModuleNotFoundError("a view needs three.js: pip install 'nonholonomic[view]'")
         numbers = _Numbers()
         facts = {
@@ -193,39 +193,16 @@ class _Numbers:
 
 def _stage(stage: Stage, numbers: _Numbers) -> dict[str, object]:
     """The data of a stage for the script."""
-    place, target, follow = view_from(stage)
+    lines = [numbers.add(line) for line in stage.arena.lines]
     return {
         "title": stage.title,
         "spacing": stage.arena.spacing,
-        "follow": follow,
-        "camera": (place, target),
-        "angle": ANGLE,
+        "follows": stage.follows,
+        "rise": stage.rise,
         "arena": numbers.described(stage.arena.mesh)
-        | {"lines": [numbers.add(line) for line in stage.arena.lines], "axes": stage.arena.axes},
+        | {"lines": lines, "axes": stage.arena.axes, "normal": stage.arena.normal.tolist()},
         "runs": numbers.described(stage.shows),
     }
-
-
-def view_from(stage: Stage) -> tuple[list[float], list[float], bool]:
-    """Position and target of the camera [m], and whether it must follow the body, because the body is small compared with
-    its path."""
-    paths = [finite(show.bodies[0].position) for show in stage.shows]
-    size = max(show.size for show in stage.shows)
-    points = np.concatenate(paths)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    reach = np.linalg.norm(points - middle, axis=-1).max()
-    follow = stage.follows or bool(reach > 4.0 * size)
-    if follow:
-        starts = np.stack([path[0] for path in paths])
-        middle = starts.mean(axis=0)
-        reach = 1.1 * size + np.linalg.norm(starts - middle, axis=-1).max()
-    normal = stage.arena.normal
-    view_axis = np.array([0.35, -1.0, 0.0])
-    view_axis = view_axis - (view_axis @ normal) * normal
-    direction = stage.rise * normal + view_axis / np.linalg.norm(view_axis)
-    distance = 1.05 * (reach + 1.6 * size) / np.sin(np.radians(ANGLE) / 2.0)
-    place = middle + distance * direction / np.linalg.norm(direction)
-    return place.tolist(), middle.tolist(), follow
 
 
 # What a command line writes and prints at the end.
@@ -276,7 +253,7 @@ def can_draw() -> bool:
 
 def without_motion() -> str:
     """Why pages have no motion; empty if three.js is installed."""
-    return "" if can_view() else NO_VIEW
+    return "" if find_spec(PACKAGE) else NO_VIEW
 
 
 def page_of_job(stages: Callable[[], list[Stage]], title: str, speed: float, below: str) -> Page:
@@ -477,6 +454,38 @@ def require_labels(label: Label, runs: list[Any]) -> list[str]:
     if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
         raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
     return list(labels)
+
+
+def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> "Figure":
+    """Draw the curves of all runs on stages over time, with a panel for each label.
+
+    **Arguments:** `names`: names of the runs for the legend, by default those on the page.
+
+    **Returns:** a matplotlib figure.
+    """
+    shows = [show for stage in stages for show in stage.shows]
+    labels = list(dict.fromkeys(curve.label for show in shows for curve in show.curves))
+    figure = new_figure(7.0, 1.3 + 1.5 * len(labels))
+    panels = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
+    names = names or [show.name if len(shows) > 1 else "" for show in shows]
+    for label, panel in zip(labels, panels, strict=True):
+        for show, name in zip(shows, names, strict=True):
+            style = {"color": css(show.colour), "linewidth": 1.0}
+            for curve in show.curves:
+                if curve.label == label:
+                    panel.plot(show.times, curve.factor * curve.values, label=name or None, **style)
+            for moment, words in show.marks:
+                panel.axvline(moment, linestyle=":", label=words, **style)
+        panel.margins(x=0.0)
+        ends = panel.get_ylim()
+        # Draw values that are constant except for round-off as a constant.
+        least = LEAST_RANGE * np.max(np.abs(ends))
+        if np.ptp(ends) < least:
+            panel.set_ylim(np.mean(ends) - least, np.mean(ends) + least)
+        panel.set_ylabel(label, fontsize="small")
+    panel.set_xlabel("time [s]")
+    legend_above(panels[0])
+    return figure
 
 
 # Films, recorded by a browser.

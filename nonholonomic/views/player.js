@@ -80,7 +80,7 @@ window.views = window.views || {};
       button("Reset", "the first view", () => { toggle(follow, (stage.follows = fact.follow)); toggle(orbit, (stage.orbits = false)); stage.reset(); stage.render(); });
       const toggle = (one, on) => one.setAttribute("aria-pressed", String(on));
       toggle(follow, stage.follows); toggle(orbit, false);
-      element("b", caption, { textContent: fact.title });
+      if (fact.title) element("b", caption, { textContent: fact.title });
       const notes = new Set(fact.runs.map((run) => run.note).filter(Boolean));
       for (const note of notes) element("span", caption, { className: "warning", textContent: note });
       const names = fact.runs.length > 1 ? fact.runs.map((run) => [run.name, run.colour]) : [];
@@ -237,8 +237,8 @@ window.views = window.views || {};
         stage.look(stage.fact.runs.map((_, r) => this.show(stage, r, this.now)), stage.follows);
         stage.render();
         stage.values.forEach((value, k) => {
-          const { size, unit } = stage.runs[0].arrows[k];
-          if (value) value.textContent = ` ${views.digits(size, 3)} ${unit}`;
+          const { shownSize, unit } = stage.runs[0].arrows[k];
+          if (value) value.textContent = ` ${views.digits(shownSize, 3)} ${unit}`;
         });
       }
       this.strips.draw(this.now);

@@ -1,8 +1,9 @@
-"""Plots of tables, of quantities over time, of the curves of a page, and of fits (needs matplotlib)."""
+"""Plots of tables, of quantities over time, and of fits (needs matplotlib)."""
 
 import io
 import itertools
 import math
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from ..parameters import meant, short_names
 from ..text import UNITS, Unit, in_unit, likely, readable_unit, shown
 from ..validation import require
-from .stage import Marks, Stage, css
+from .stage import Marks
 
 # Only for type checkers: matplotlib is optional, and plots stand below tables and fits, which use them.
 if TYPE_CHECKING:
@@ -32,8 +33,9 @@ QUANTILES = (0.02, 0.98)
 #: Relative difference from a value of an axis that counts as none.
 ROUND_OFF = 1e-9
 
-#: An axis with at most this many values is drawn as one line per value.
-MOST_LINES = 8
+#: An axis with at most this many values is drawn as one line per value; height of the first line's marks of cells without a
+#: value, as a part of the picture.
+MOST_LINES, MARK = 8, 0.03
 
 #: More points of a bifurcation diagram than this are drawn smaller.
 MOST_POINTS = 2000
@@ -41,11 +43,11 @@ MOST_POINTS = 2000
 #: A map of whole numbers with at most this many values has a colour for each.
 MOST_COLOURS = 10
 
-#: Number of characters for which a legend above the panels has room.
-WIDTH = 90
+#: Size of a panel [inches], and number of characters for which a legend or a title above it has room.
+PANEL, WIDTH = (7.0, 2.0), 90
 
-#: Relative range of values below which a panel of curves draws them as constant.
-LEAST_RANGE = 1e-3
+#: The ratio of the ranges of components named x, y and z below which they are a path, with one scale.
+EQUAL = 4.0
 
 
 def new_figure(width: float = 7.0, height: float = 4.5) -> "Figure":
@@ -61,6 +63,11 @@ def new_figure(width: float = 7.0, height: float = 4.5) -> "Figure":
 
     figure._repr_png_ = png
     return figure
+
+
+def draw_title(figure: Any, text: str) -> None:
+    """Write a title of as many lines as it needs above all of a figure."""
+    figure.suptitle(textwrap.fill(text, int(figure.bbox_inches.width / PANEL[0] * WIDTH)), fontsize="medium")
 
 
 def draw_table(
@@ -125,7 +132,7 @@ def draw_table(
         drawing.set_yscale("log")
         _plain_numbers(drawing.yaxis)
     drawing.set_xlabel(table.label(names[0]))
-    drawing.set_title(", ".join(cuts), fontsize="medium")
+    drawing.set_title(textwrap.fill(", ".join(cuts), WIDTH // 2), fontsize="medium")
     return drawing.figure if ax is None else ax
 
 
@@ -196,15 +203,26 @@ def _cut_text(table: "Table", name: str, place: int, wanted: float | None = None
 def _draw_lines(
     drawing: "Axes", table: "Table", names: list[str], lines: np.ndarray, label: str | None, words: np.ndarray | None
 ) -> None:
-    """Draw a line for each column; without any finite value, count the statuses of the cells."""
+    """Draw a line for each column, and at the bottom the marks of the statuses of cells without a finite value; without any
+    finite value, count the statuses."""
     marker, values = "o-" if len(lines) <= 100 else "-", table.coords[names[0]]
+    has_number = np.isfinite(lines)
+    lost = np.full(lines.shape, "")
+    if words is not None and np.any(has_number):
+        lost = np.where(has_number, "", words.reshape(lines.shape))
+    marks = dict(zip(filter(None, np.unique(lost).tolist()), "x+1234", strict=False))
     for index, line in enumerate(lines.T):
         texts = [label or "", _cut_text(table, names[1], index) if len(names) > 1 else ""]
         text = ", ".join(filter(None, texts))
-        drawing.plot(values, line, marker, markersize=3, label=text or None)
-    if len(names) > 1 or label:
+        (curve,) = drawing.plot(values, line, marker, markersize=3, label=text or None)
+        for word, mark in marks.items():
+            heights = np.where(lost[:, index] == word, MARK * (1 + index), np.nan)
+            drawing.plot(values, heights, mark, color=curve.get_color(), transform=drawing.get_xaxis_transform())
+    for word, mark in marks.items():
+        drawing.plot([], [], mark, color="0.35", label=word.replace("_", " "))
+    if drawing.get_legend_handles_labels()[1]:
         drawing.legend()
-    if not np.any(np.isfinite(lines)):
+    if not np.any(has_number):
         # The abscissa stays that of the table.
         if values.dtype.kind != "U" and len(values) > 1:
             drawing.set_xlim(values.min(), values.max())
@@ -259,17 +277,9 @@ def _mark_words(drawing: "Axes", table: "Table", names: list[str], words: np.nda
         )
         patches.append(Patch(color=grey, label=word.replace("_", " ")))
     if patches:
-        # The legend stands in the corner of the map with the fewest values.
-        x, y = (np.argsort(table.coords[name], kind="stable") for name in names)
-        is_empty = (words != "")[x][:, y]
-        width, height = ((size + 2) // 3 for size in is_empty.shape)
-        shares = {
-            f"{vertical} {horizontal}": np.mean(is_empty[columns, rows])
-            for vertical, rows in (("upper", slice(-height, None)), ("lower", slice(height)))
-            for horizontal, columns in (("right", slice(-width, None)), ("left", slice(width)))
-        }
-        emptiest: Any = max(shares, key=lambda corner: shares[corner])
-        drawing.legend(handles=patches, loc=emptiest)
+        # Below the label of the horizontal axis, where it covers no cell.
+        place = {"loc": "upper left", "bbox_to_anchor": (0.0, 0.0), "borderaxespad": 4.2}
+        drawing.legend(handles=patches, ncols=3, fontsize="small", **place)
 
 
 def draw_portrait(table: "Table", x: str, y: str, ax: "Axes | None" = None) -> "FigureBase | Axes":
@@ -291,8 +301,9 @@ def draw_portrait(table: "Table", x: str, y: str, ax: "Axes | None" = None) -> "
     drawing.plot(x_values[:1], y_values[:1], "o", color=line.get_color())
     drawing.set_xlabel(x_label)
     drawing.set_ylabel(y_label)
-    if {x, y} == {"position.x", "position.y"}:
-        # A path, seen from above.
+    low, high = sorted(float(np.nanmax(part) - np.nanmin(part)) for part in (x_values, y_values))
+    # A path, seen from above.
+    if {x, y} == {"position.x", "position.y"} or ({x, y} < {"x", "y", "z"} and high < EQUAL * low):
         drawing.set_aspect("equal", adjustable="datalim")
     return drawing.figure if ax is None else ax
 
@@ -319,9 +330,8 @@ def column(table: "Table", argument: str, name: object, vectors: bool = False) -
 
 # Plots of quantities of runs over time (needs matplotlib).
 
-#: Styles of the lines of a vector's components, and size of a panel [inches].
-STYLES = ("-", "--", ":", "-.")
-PANEL = (7.0, 2.0)
+#: Styles of the lines of a vector's components; marks of times are dotted.
+STYLES = ("-", "--", "-.", ":")
 
 
 def draw_series(
@@ -359,61 +369,33 @@ def draw_series(
             else:
                 values, quantity = column(table, "quantity", name, vectors=True)
                 lines = [("", values)]
-            for (component, values), style in zip(lines, itertools.cycle(STYLES)):
-                text = ", ".join(part for part in (label, component) if part)
+            for k, ((component, values), style) in enumerate(zip(lines, itertools.cycle(STYLES))):
+                # Of several runs, colours and styles are explained apart, each once.
+                text = ", ".join(filter(None, (label, component))) if len(tables) == 1 else "" if k else label
                 # A line without a text stays out of the legend.
                 (line,) = panel.plot(table["time"], values, style, linewidth=1.2, color=colour, label=text or None)
                 colour = line.get_color()
             for time, words in marked:
                 panel.axvline(time, color=colour, linestyle=":", linewidth=1.2, label=words)
             panel.set_ylabel(quantity)
+        for (component, _), style in zip(lines if len(tables) > 1 and lines[0][0] else (), itertools.cycle(STYLES)):
+            panel.plot([], [], style, color="0.35", linewidth=1.2, label=component)
         panel.margins(x=0.0)
         # Not again below a panel that has the same.
         if (texts := panel.get_legend_handles_labels()[1]) != explained:
-            _legend_above(panel)
+            legend_above(panel)
             explained = texts
     panels[-1].set_xlabel(tables[0].label("time"))
     return figure or panels[0]
 
 
-def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> "Figure":
-    """Draw the curves of all runs on stages over time, with a panel for each label.
-
-    **Arguments:** `names`: names of the runs for the legend, by default those on the page.
-
-    **Returns:** a matplotlib figure.
-    """
-    shows = [show for stage in stages for show in stage.shows]
-    labels = list(dict.fromkeys(curve.label for show in shows for curve in show.curves))
-    figure = new_figure(7.0, 1.3 + 1.5 * len(labels))
-    panels = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
-    names = names or [show.name if len(shows) > 1 else "" for show in shows]
-    for label, panel in zip(labels, panels, strict=True):
-        for show, name in zip(shows, names, strict=True):
-            style = {"color": css(show.colour), "linewidth": 1.0}
-            for curve in show.curves:
-                if curve.label == label:
-                    panel.plot(show.times, curve.factor * curve.values, label=name or None, **style)
-            for time, words in show.marks:
-                panel.axvline(time, linestyle=":", label=words, **style)
-        panel.margins(x=0.0)
-        low, high = panel.get_ylim()
-        middle = (low + high) / 2.0
-        # Draw values that are constant except for round-off as a constant.
-        min_range = LEAST_RANGE * max(abs(low), abs(high))
-        if high - low < min_range:
-            panel.set_ylim(middle - min_range, middle + min_range)
-        panel.set_ylabel(label, fontsize="small")
-    panel.set_xlabel("time [s]")
-    _legend_above(panels[0])
-    return figure
-
-
-def _legend_above(panel: "Axes") -> None:
+def legend_above(panel: "Axes") -> None:
     """Draw the legend of a panel, if it has one, above it, where it covers no curve."""
-    if texts := panel.get_legend_handles_labels()[1]:
+    handles, texts = panel.get_legend_handles_labels()
+    if texts:
+        texts = [textwrap.fill(text, WIDTH) for text in texts]
         columns = min(len(texts), max(1, WIDTH // (max(map(len, texts)) + 6)))
-        panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize="small")
+        panel.legend(handles, texts, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize="small")
 
 
 # The picture of a fit: data and model, residuals, distributions and correlations.
@@ -511,7 +493,7 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figur
         axes.set_yticks(range(len(names)), short, fontsize=8)
         axes.set_title("correlation", fontsize=9)
         figure.colorbar(image, ax=axes, shrink=0.8)
-    figure.suptitle(str(fit.verdict), fontsize=10, wrap=True)
+    draw_title(figure, str(fit.verdict))
     return figure
 
 
@@ -562,12 +544,10 @@ def _draw_data(drawn: _Drawn, axes: "Axes", series: list[int], abscissa: np.ndar
         colour, indices = f"C{k}", drawn.series[k]
         exact = indices[~drawn.is_limit[indices]]
         text = drawn.names[k] if several else "measured"
-        axes.errorbar(
-            abscissa[exact], drawn.value[exact], drawn.errors[exact], fmt=".", color=colour, alpha=0.6, label=text
-        )
+        axes.errorbar(abscissa[exact], drawn.value[exact], drawn.errors[exact], fmt=".", color=colour, label=text)
         if has_time and len(drawn.curves):
             moments, curve = (part[:, indices].T.reshape(-1) for part in (drawn.times, drawn.curves))
-            axes.plot(moments, curve, "-", color=colour, linewidth=1.2, label=None if several else "predicted")
+            axes.plot(moments, curve, color=colour, alpha=0.5, linewidth=1.2, label=None if several else "predicted")
         else:
             allowed = exact[np.isfinite(drawn.predicted[exact])]
             text = "predicted" if k == series[0] else None

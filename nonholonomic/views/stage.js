@@ -7,6 +7,8 @@ window.views = window.views || {};
   const CREASE = cos(0.8);
   //: Least height of the camera above the tangent plane, divided by its distance, so that it cannot look from below.
   const LOWEST = 0.06;
+  //: Opening angle of the camera in degrees, and the part of the width and of the height that a level rectangle with axes fills.
+  const ANGLE = 35, FILLED = [0.7, 0.8];
   //: Colours behind the arena and of the lines on it.
   const BACKGROUND = "#fbfbfa", LINES = "#7c8896";
   const element = (kind, parent, properties = {}) => parent.appendChild(Object.assign(document.createElement(kind), properties));
@@ -58,7 +60,7 @@ window.views = window.views || {};
       this.labels = element("div", box, { className: "labels" });
       this.scene = new THREE.Scene();
       this.scene.background = new THREE.Color(BACKGROUND);
-      this.camera = new THREE.PerspectiveCamera(fact.angle, 1, 0.01 * this.size, 1e4 * this.size);
+      this.camera = new THREE.PerspectiveCamera(ANGLE, 1, 0.01 * this.size, 1e4 * this.size);
       this.camera.up.set(0, 0, 1);
       this.controls = new THREE.OrbitControls(this.camera, this.renderer.domElement);
       this.controls.addEventListener("change", () => this.render());
@@ -66,6 +68,7 @@ window.views = window.views || {};
       this.arena(fact.arena);
       this.runs = fact.runs.map((run) => this.run(run));
       this.fit();
+      fact.camera = this.placed();
       this.reset();
       new ResizeObserver(() => { if (this.fit()) this.render(); }).observe(box);
     }
@@ -132,7 +135,10 @@ window.views = window.views || {};
         const point = (along, across) => (k ? [across, along, low[2]] : [along, across, low[2]]);
         const mark = (textContent, along, away) => this.marks.push({
           label: element("span", this.labels, { className: "mark", textContent }),
-          at: new this.THREE.Vector3(...point(along, low[1 - k] - away * gap)),
+          at: new this.THREE.Vector3(...point(along, low[1 - k])),
+          beyond: new this.THREE.Vector3(...point(along, low[1 - k] - gap)),
+          axis: k,
+          isName: away > 1,
         });
         const first = Math.ceil(begin / step - 1e-9), count = Math.floor(end / step + 1e-9) - first + 1;
         for (let n = first; n < first + count; n++) {
@@ -140,13 +146,14 @@ window.views = window.views || {};
           lines.push(Float32Array.from([...point(along, low[1 - k]), ...point(along, high[1 - k])]));
           if (count <= 12) mark(String(Number((n * step).toPrecision(6))), along, 1);
         }
-        mark(name, (low[k] + high[k]) / 2, count <= 12 ? 3 : 1);
+        mark(name, (low[k] + high[k]) / 2, 2);
       });
       return lines;
     }
     run(fact) {
       const bodies = fact.bodies.map((body) => this.body(body.meshes));
-      const traces = fact.traces.map((trace) => this.trace(trace));
+      // Traces of several runs have the colours of the runs.
+      const traces = fact.traces.map((trace) => this.trace(this.fact.runs.length > 1 ? { ...trace, colour: fact.colour } : trace));
       const arrows = fact.arrows.map((arrow) => this.arrow(arrow));
       const name = this.fact.runs.length > 1 ? element("span", this.labels, { className: "name", textContent: fact.name }) : null;
       if (name) name.style.background = fact.colour;
@@ -180,7 +187,7 @@ window.views = window.views || {};
     }
     // A shaft of length one, which is scaled, and a tip; an arrow that is visible through the body has a ball at its start.
     // A line has no unit, and no tip.
-    arrow({ colour, width, through, unit, scale, limit, shown }) {
+    arrow({ colour, width, through, unit, factor, scale, limit, shown }) {
       const { THREE, scene } = this, group = new THREE.Group(), head = unit ? 5 * width : 0;
       const material = new THREE.MeshPhongMaterial({ color: colour, specular: 0, depthTest: !through, transparent: through });
       const part = (geometry) => {
@@ -197,7 +204,7 @@ window.views = window.views || {};
       const label = element("span", this.labels, { className: "force" });
       // Dark enough to be read on the ground.
       label.style.color = new THREE.Color(colour).multiplyScalar(0.5).getStyle();
-      return { group, shaft, tip, head, unit, scale, limit: limit ?? Infinity, label, shown, size: 0 };
+      return { group, shaft, tip, head, unit, factor, scale, limit: limit ?? Infinity, label, shown, size: 0, shownSize: 0 };
     }
 
     // Setters, for the player or a live simulation.
@@ -215,6 +222,8 @@ window.views = window.views || {};
     setArrow(run, number, start, vector) {
       const arrow = this.runs[run].arrows[number], { group, shaft, tip } = arrow;
       arrow.size = hypot(...vector);
+      // Round-off, whose arrow nobody sees, is 0.
+      arrow.shownSize = arrow.size * arrow.scale < 1e-9 * this.size ? 0 : arrow.factor * arrow.size;
       const length = min(arrow.size * arrow.scale, arrow.limit), head = min(arrow.head, 0.6 * length);
       group.visible = arrow.shown && length > 0.02 * arrow.head;
       if (!group.visible) return;
@@ -250,6 +259,42 @@ window.views = window.views || {};
         Object.assign(material, { transparent: k > 0 && near, opacity: k > 0 && near ? 0.5 : 1 });
       })));
     }
+    // The first place and target of the camera. It follows bodies that are small compared with their paths. Otherwise a level
+    // rectangle with axes, and all that is drawn above it, fill the picture, but for the room of the labels.
+    placed() {
+      const { THREE: { Box3, Vector3 }, fact: { arena, runs, follows, rise }, size } = this, { fov, aspect } = this.camera;
+      const points = (values) => {
+        const list = [];
+        for (let k = 0; k + 2 < values.length; k += 3) if (Number.isFinite(values[k] + values[k + 1] + values[k + 2])) list.push(new Vector3().fromArray(values, k));
+        return list;
+      };
+      const centred = (list) => { const middle = new Box3().setFromPoints(list).getCenter(new Vector3()); return [middle, list.reduce((far, p) => max(far, p.distanceTo(middle)), 0)]; };
+      const paths = runs.map(({ bodies }) => points(bodies[0].position)), normal = new Vector3(...arena.normal), aside = new Vector3(0.35, -1, 0);
+      let [middle, reach] = centred(paths.flat());
+      this.fact.follow = follows || reach > 4 * size;
+      if (this.fact.follow) {
+        [middle, reach] = centred(paths.map(([start]) => start));
+        reach += 1.1 * size;
+      }
+      const back = aside.addScaledVector(normal, -aside.dot(normal)).normalize().addScaledVector(normal, rise).normalize();
+      let distance = (1.05 * (reach + 1.6 * size)) / Math.sin((ANGLE * Math.PI) / 360);
+      if (arena.axes.length && !this.fact.follow) {
+        const farthest = (meshes) => max(0, ...meshes.map(({ vertices }) => points(vertices).reduce((far, p) => max(far, p.length()), 0)));
+        const drawn = points(arena.vertices);
+        for (const { bodies, arrows } of runs) {
+          for (const { position, meshes } of bodies) { const height = farthest(meshes); for (const p of points(position)) drawn.push(p.setZ(p.z + height)); }
+          for (const { start, vector } of arrows) drawn.push(...points(start.map((x, k) => x + vector[k])));
+        }
+        [middle] = centred(drawn);
+        const right = new Vector3().crossVectors(normal, back).normalize(), up = back.clone().cross(right), half = Math.tan((fov * Math.PI) / 360);
+        distance = 0;
+        for (const p of drawn) {
+          p.sub(middle);
+          distance = max(distance, p.dot(back) + max(Math.abs(p.dot(up)) / FILLED[1], Math.abs(p.dot(right)) / (FILLED[0] * aspect)) / half);
+        }
+      }
+      return [middle.clone().addScaledVector(back, distance).toArray(), middle.toArray()];
+    }
     reset() {
       const [place, target] = this.fact.camera;
       this.camera.position.set(...place);
@@ -282,7 +327,7 @@ window.views = window.views || {};
       for (const { traces } of this.runs) for (const { line } of traces) line.material.resolution.set(width, height);
       this.camera.aspect = width / height;
       // A narrow picture shows as much horizontally as a square picture shows vertically.
-      this.camera.fov = 2 * Math.atan(Math.tan((this.fact.angle * Math.PI) / 360) / min(1, this.camera.aspect)) * 180 / Math.PI;
+      this.camera.fov = 2 * Math.atan(Math.tan((ANGLE * Math.PI) / 360) / min(1, this.camera.aspect)) * 180 / Math.PI;
       this.camera.updateProjectionMatrix();
       return true;
     }
@@ -317,17 +362,27 @@ window.views = window.views || {};
         const at = point.clone().project(camera);
         return [((at.x + 1) / 2) * width, ((1 - at.y) / 2) * height, at.z < 1 && Math.abs(at.x) < 1 && Math.abs(at.y) < 1];
       };
-      for (const { label, at } of this.marks) {
-        const [x, y, seen] = onScreen(at);
+      // Labels of an axis stand outside of it, wherever the camera is, and its name beyond the widest of them.
+      const widest = [0, 0];
+      for (const mark of this.marks) {
+        mark.label.style.display = "";
+        mark.sizes = mark.sizes?.[0] ? mark.sizes : [mark.label.offsetWidth, mark.label.offsetHeight];
+        if (!mark.isName) widest[mark.axis] = max(widest[mark.axis], mark.sizes[0]);
+      }
+      for (const { label, at, beyond, axis, isName, sizes: [wide, high] } of this.marks) {
+        const [x, y, seen] = onScreen(at), [toX, toY] = onScreen(beyond), far = hypot(toX - x, toY - y) || 1, [u, v] = [(toX - x) / far, (toY - y) / far];
+        const away = 5 + (Math.abs(u) * wide + Math.abs(v) * high) / 2 + (isName ? Math.abs(u) * widest[axis] + Math.abs(v) * high : 0);
         label.style.display = seen ? "" : "none";
-        label.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -50%)`;
+        label.style.transform = `translate(${(x + u * away).toFixed(1)}px, ${(y + v * away).toFixed(1)}px) translate(-50%, -50%)`;
       }
       const taken = [];
       // A label that would overlap another one moves up.
-      const put = (label, [x, below, seen], lift) => {
+      const put = (label, [at, below, seen], lift) => {
         label.style.display = seen ? "" : "none";
         if (!seen) return;
         const wide = 7 * label.textContent.length + 12;
+        // Nor does it leave the picture.
+        const x = max(0, min(at, width - wide));
         let y = below - lift;
         for (const other of taken.sort((a, b) => b.y - a.y)) {
           if (x < other.x + other.wide && other.x < x + wide && Math.abs(y - other.y) < 19) y = other.y - 19;
@@ -343,7 +398,7 @@ window.views = window.views || {};
         for (const arrow of run.arrows) {
           if (arrow.unit !== "N" || !arrow.group.visible || k > 0) { arrow.label.style.display = "none"; continue; }
           const end = new THREE.Vector3(0, arrow.length, 0).applyQuaternion(arrow.group.quaternion).add(arrow.group.position);
-          arrow.label.textContent = `${views.digits(arrow.size, 3)} N`;
+          arrow.label.textContent = `${views.digits(arrow.shownSize, 3)} N`;
           put(arrow.label, onScreen(end), 14);
         }
       });

@@ -60,8 +60,9 @@ class Trace(NamedTuple):
 class Arrow(NamedTuple):
     """A vector that changes over time: its start, and its components in `unit`; without a unit, a line without a tip.
 
-    It is drawn `scale` metres long per unit, and no longer than `limit` [m]. With `through`, it is visible through the
-    body and has a ball at its start. `shown`: whether a page shows it at first.
+    It is drawn `scale` metres long per SI unit, and no longer than `limit` [m]. With `through`, it is visible through the
+    body and has a ball at its start. `shown`: whether a page shows it at first. `factor` converts its size, in SI units, to
+    `unit`.
     """
 
     name: str
@@ -74,6 +75,7 @@ class Arrow(NamedTuple):
     limit: float | None = None
     through: bool = False
     shown: bool = True
+    factor: float = 1.0
 
 
 class Curve(NamedTuple):
@@ -133,7 +135,8 @@ class Stage(NamedTuple):
 
 
 def curves_in(stages: list[Stage], unit: Unit) -> list[Stage]:
-    """The stages with their curves in other units, as for `in_unit`, if their labels end in a unit that can be converted.
+    """The stages with their curves, if their labels end in a unit that can be converted, and the sizes of their arrows in
+    other units, as for `in_unit`.
 
     **Raises:** `ValueError` if no curve can be drawn in the unit.
     """
@@ -148,10 +151,16 @@ def curves_in(stages: list[Stage], unit: Unit) -> list[Stage]:
         text, factor = in_unit(si, unit)
         return curve._replace(label=f"{name} [{text}]", factor=factor) if bracket else curve
 
-    return [
-        stage._replace(shows=tuple(show._replace(curves=tuple(map(drawn, show.curves))) for show in stage.shows))
-        for stage in stages
-    ]
+    def shown_in(show: Show) -> Show:
+        arrows = (arrow._replace(**converted(arrow.unit, unit)) for arrow in show.arrows)
+        return show._replace(curves=tuple(map(drawn, show.curves)), arrows=tuple(arrows))
+
+    return [stage._replace(shows=tuple(map(shown_in, stage.shows))) for stage in stages]
+
+
+def converted(si: str, unit: Unit) -> dict[str, str | float]:
+    """The fields `unit` and `factor` of what is shown in another unit, as for `in_unit`."""
+    return dict(zip(("unit", "factor"), in_unit(si, unit), strict=True))
 
 
 #: Colours of a page's runs, for the curves, their numbers and one half of the body, with a contrast of 4.5 to 1 on white and to
@@ -161,15 +170,6 @@ COLOURS = (0xC8412B, 0x2A6FB0, 0x28794C, 0x8C5A3C, 0xB8437F, 0x2A7A87)
 #: Colour of the other half of the body.
 PALE = 0xF4E9D2
 DARK = 0x3A3A3E
-
-
-def distinguished_by_colour(shows: tuple[Show, ...]) -> tuple[Show, ...]:
-    """The shows of a stage; if there are several, the traces of each get its colour."""
-    if len(shows) == 1:
-        return shows
-    return tuple(
-        show._replace(traces=tuple(trace._replace(colour=show.colour) for trace in show.traces)) for show in shows
-    )
 
 
 def finite(points: Points) -> Points:

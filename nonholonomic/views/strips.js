@@ -3,7 +3,7 @@
 window.views = window.views || {};
 (() => {
   const digits = (v, count = 4) =>
-    v === 0 ? "0" : Math.abs(v) < 1e-3 || Math.abs(v) >= 1e5 ? v.toExponential(2) : v.toPrecision(count);
+    v === 0 ? "0" : Math.abs(v) < 1e-3 || Math.abs(v) >= 1e5 ? v.toExponential(2) : Math.abs(v) >= 10 ** count ? String(Math.round(v)) : v.toPrecision(count);
 
   // The place of a time among the times of a run: the index before it, and the fraction of the interval after that index.
   function place(times, time) {
@@ -77,8 +77,8 @@ window.views = window.views || {};
         // Draw values that are constant except for round-off as a constant.
         const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high)) || 1;
         if (!(high - low > least)) { low -= least; high += least; }
-        // Label the round-off of a body at the ground as 0.
-        const rounded = (end) => Math.abs(end) < 1e-8 * (high - low) ? 0 : end;
+        // Label what is no pixel away from 0 as 0, such as the round-off of a body at the ground.
+        const rounded = (end) => Math.abs(end) < 1e-3 * (high - low) ? 0 : end;
         [low, high] = [rounded(low), rounded(high)];
         Object.assign(strip, { low, high, ahead: null });
       }
@@ -131,7 +131,11 @@ window.views = window.views || {};
         if (strip !== this.strips[0]) return;
         const left = strip.x(at) < 0.6 * x1;
         pen.textAlign = left ? "left" : "right";
-        pen.fillText(words, strip.x(at) + (left ? 6 : -6) * ratio, y0 - (6 + 1.2 * TEXT * k) * ratio);
+        const label = [words, strip.x(at) + (left ? 6 : -6) * ratio, y0 - (6 + 1.2 * TEXT * k) * ratio];
+        // Readable over curves.
+        pen.save();
+        Object.assign(pen, { strokeStyle: "#ffffffd9", lineWidth: 5 * ratio, lineJoin: "round" });
+        pen.strokeText(...label); pen.restore(); pen.fillText(...label);
       }));
       upright(now, []);
       if (this.pointed !== null) upright(strip.x(this.pointed), [3 * ratio, 3 * ratio]);

@@ -16,7 +16,7 @@ from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit, shown
 from nonholonomic.validation import explaining, require_file, require_flag, require_kind, require_package, require_whole
 from nonholonomic.views import DARK, Body, Mesh, Page, Stage, bar, page
-from nonholonomic.views.plot import new_figure
+from nonholonomic.views.plot import draw_title, new_figure
 from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
 from ..model.dynamics import Dynamics, padded
@@ -120,35 +120,43 @@ class Plan(eqx.Module):
         require_package("matplotlib", "plot", "plot")
         require_unit(unit)
         problem, surface, figure = self.problem, self.problem.scene.surface, new_figure(9.0, 4.5)
-        grid, axes = figure.add_gridspec(1, 2, width_ratios=(3, 2)), 2 if isinstance(surface, Plane) else 3
-        above = figure.add_subplot(grid[0], **({"projection": "3d", "elev": 60.0} if axes == 3 else {}))
-        curves = figure.add_subplot(grid[1])
+        grid, axes = figure.add_gridspec(2, 2, width_ratios=(3, 2)), 2 if isinstance(surface, Plane) else 3
+        above = figure.add_subplot(grid[:, 0], **({"projection": "3d", "elev": 60.0} if axes == 3 else {}))
 
         def draw(points: Corners, colour: str, width: float, label: str | None = None, marker: str = "") -> None:
             above.plot(*np.asarray(points).T[:axes], marker, color=colour, linewidth=width, label=label)
 
+        is_cross, target = problem.goal.heading is None, goal_corners(problem)
+        path = np.concatenate([self.run.position, target])
+        middle, reach = path.mean(axis=0), 0.6 * np.ptp(path, axis=0).max() + problem.scene.body.wheelbase
         for line in planned_stage(self).arena.lines if axes == 3 else ():
-            draw(line, "0.7", 0.4)
+            draw(np.where(np.abs(line - middle).max(axis=-1, keepdims=True) < reach, line, np.nan), "0.7", 0.4)
         for foot in (fixed(surface, line) for line in problem.outlines):
-            above.fill(*foot.T[:2], color="0.6") if axes == 2 else draw(foot[[*range(len(foot)), 0]], "0.4", 1.5)
+            draw(foot[[*range(len(foot)), 0]], "0.4", 1.5, "obstacles")
+            if axes == 2:
+                above.fill(*foot.T[:2], color="0.6")
         for line in self.candidates:
-            draw(line, "0.75", 0.7)
+            draw(line, "0.55", 0.7, "candidates")
         drawn = np.linspace(0, len(self.run.t) - 1, OUTLINES).astype(int)
         for corners in outlines(problem, problem.footprint, self.run.state[drawn, : 2 * surface.axes]):
-            draw(corners[CLOSED], "C0", 0.6)
+            draw(corners[CLOSED], "C0", 0.6, "footprint")
         draw(self.run.position, "C0", 1.5, "rear axle")
-        is_cross, target = problem.goal.heading is None, goal_corners(problem)
         draw(target.mean(axis=0)[None] if is_cross else target[CLOSED], "C2", 1.2, "goal", "x" if is_cross else "")
         above.grid(False)
         above.locator_params(nbins=5 if axes == 3 else "auto")
         above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", **({"zticks": []} if axes == 3 else {}))
-        above.set_title("reaches the goal" if self.reached else "; ".join(self.hindrances), fontsize="small")
-        above.legend(fontsize="small")
-        for name, values, si in (("speed", self.run.speed, "m/s"), ("steering angle", self.run.steering, "rad")):
+        handles, texts = above.get_legend_handles_labels()
+        unique = dict(zip(texts, handles, strict=True))
+        above.legend(
+            [*unique.values()], [*unique], fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3
+        )
+        for k, (name, values, si) in enumerate(
+            (("speed", self.run.speed, "m/s"), ("steering", self.run.steering, "rad"))
+        ):
             text, factor = in_unit(si, unit)
-            curves.plot(self.run.t, factor * values, label=f"{name} [{text}]")
-        curves.set_xlabel("time [s]")
-        curves.legend(fontsize="small")
+            panel = figure.add_subplot(grid[k, 1], xlabel="time [s]" if k else "", ylabel=f"{name} [{text}]")
+            panel.plot(self.run.t, factor * values, color="C0")
+        draw_title(figure, "reaches the goal" if self.reached else "; ".join(self.hindrances))
         return figure
 
     @status_line("drawing")

@@ -76,7 +76,7 @@ def grouped(groups: list[list[tuple[int, Trajectory]]], names: list[str]) -> lis
     """A stage for each group of numbered rides on a common ground; `names` are the names of the rides."""
     stages = []
     for group in groups:
-        shows = views.distinguished_by_colour(tuple(show(run, k, names[k]) for k, run in group))
+        shows = tuple(show(run, k, names[k]) for k, run in group)
         ground = ground_of([run for _, run in group], shows[0].normal[0])
         stages.append(views.Stage("; ".join(body.name for body in shows), ground, shows))
     return stages
@@ -147,7 +147,9 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
     scale, width = WEIGHT * length / float(scene.body.mass * scene.gravity), 0.035 * length
     grip = np.asarray(run["grip"])[:, : len(run.loaded_axles)]
     curves = [views.Curve(label, values[quantity]) for quantity, label in CURVES.items()]
-    curves.append(views.Curve("friction that the tyres need [1]", reader(np.minimum(grip, DRAWN_GRIP)).max(axis=-1)))
+    curves.append(
+        views.Curve("friction that the tyres need [1]", reader(np.minimum(np.round(grip, 12), DRAWN_GRIP)).max(axis=-1))
+    )
     warning = f"needs friction {np.max(grip):.2g}, more than any tyre provides: a real stroller would slip"
     return views.Show(
         name,

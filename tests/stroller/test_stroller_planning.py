@@ -154,10 +154,18 @@ def test_a_plan_shows_what_it_achieves(parked, tmp_path):
     assert f"  grip       {words} force of up to {force:.3g} N" in lines
     assert words in str(plan.run)
     figure = plan.plot()
-    assert [line.get_label() for line in figure.axes[1].lines] == ["speed [m/s]", "steering angle [rad]"]
-    speed, steering = plan.plot(unit=("deg", "km/h")).axes[1].lines
-    assert [speed.get_label(), steering.get_label()] == ["speed [km/h]", "steering angle [deg]"]
-    assert_close(steering.get_ydata(), np.degrees(plan.run.steering))
+    assert [panel.get_ylabel() for panel in figure.axes[1:]] == ["speed [m/s]", "steering [rad]"]
+    above, speed, steering = plan.plot(unit=("deg", "km/h")).axes
+    assert [speed.get_ylabel(), steering.get_ylabel()] == ["speed [km/h]", "steering [deg]"]
+    assert_close(steering.lines[0].get_ydata(), np.degrees(plan.run.steering))
+    names = [text.get_text() for text in above.get_legend().get_texts()]
+    assert sorted(names) == ["candidates", "footprint", "goal", "obstacles", "rear axle"]
+    failed = dataclasses.replace(plan, hindrances=("the footprint overlaps obstacles[0] by 0.592 m",) * 5)
+    (title,) = (text for text in failed.plot().texts if "overlaps" in text.get_text())
+    title.figure.draw_without_rendering()
+    box = title.get_window_extent()
+    assert title.get_text().count("overlaps") == 5
+    assert 0.0 < box.x0 < box.x1 < title.figure.bbox.x1
     page = plan.view(tmp_path / "plan.html", unit="deg")
     assert "steering angle [deg]" in page.html
     assert (tmp_path / "plan.html").read_text() == page.html

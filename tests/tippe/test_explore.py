@@ -1,6 +1,7 @@
 """The page with sliders, in a real browser without a network: it says what the tables say, and everything on it can be used."""
 
 import json
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -132,7 +133,7 @@ def page(browser, rutstam_scene, tmp_path_factory):
     """The page of Rutstam's top, with two sliders, opened from disk."""
     path = tmp_path_factory.mktemp("page") / "top.html"
     sliders = {"theta": (0.05, 0.5), "spin": (60.0, 200.0)}
-    page = tippe.explore(rutstam_scene, tippe.Launch(0.1, 155.0), path, sliders, t1=7.0, unit="deg")
+    page = tippe.explore(rutstam_scene, tippe.Launch(0.1, 155.0), path, sliders, t1=7.0, unit=("deg", "rpm"))
     browser.get_log("browser")
     browser.get_log("performance")
     browser.get(path.as_uri())
@@ -185,11 +186,20 @@ def test_it_shows_the_time_of_the_launch_and_the_run(browser, page, rutstam_scen
 
 
 def test_angles_and_spins_have_their_familiar_units(browser, page):
-    """Like the launches that teachers describe: degrees, and revolutions per minute."""
+    """Like the launches that teachers describe: degrees, and revolutions per minute; in one unit, on the map, too."""
     browser.execute_script("live.set([0.209440, 157.0796])")
     texts = "return [...document.querySelectorAll('#knobs output')].map((one) => one.textContent)"
     labels = browser.execute_script(texts)
-    assert labels == ["0.209 rad = 12.0°", "157 rad/s = 1500 rpm"]
+    assert labels == ["12.0 deg", "1500 rpm"]
+    chips = browser.execute_script("return [...document.querySelectorAll('.chip')].map((one) => one.textContent)")
+    assert any(re.fullmatch("angular velocity [0-9]+ rpm", chip) for chip in chips)
+    browser.execute_script(
+        "window.told = []; const { fillText } = CanvasRenderingContext2D.prototype;"
+        "CanvasRenderingContext2D.prototype.fillText = function (...text) { told.push(text[0]); fillText.apply(this, text); };"
+        "live.map.update(live.values())"
+    )
+    wait(browser, "return told.includes('spin [rpm]') || told.some((text) => / \\[rpm\\]/.test(text))")
+    assert {"2.86", "28.6"} <= set(browser.execute_script("return told"))
 
 
 def test_its_curves_have_the_unit_that_was_asked_for(browser, page, rutstam_scene):
@@ -243,6 +253,17 @@ def test_the_map_fills_and_a_click_sets_the_sliders(browser, page, rutstam_scene
     table = tippe.inversion_table(rutstam_scene, theta=theta, spin=spin, t1=7.0, tolerance=TOLERANCE, progress=False)
     assert tippe.Status(status).word == table.status
     assert time is None or time == pytest.approx(float(table.time), rel=CLOSE)
+    # Cells without a time are hatched, and their status is named.
+    wait(browser, "return document.getElementById('legend').textContent.includes('not inverted')")
+    colours = browser.execute_script(
+        """const { cells, results } = live.map, canvas = document.querySelector('#map canvas');
+        const { x, y } = cells.find((_, k) => results()[k] && !Number.isFinite(results()[k][1]));
+        const { clientWidth, clientHeight } = canvas, [w, h] = [clientWidth - 50, clientHeight - 40];
+        const ratio = canvas.width / clientWidth, place = [48 + (x / 40) * w, 2 + h - ((y + 1) / 30) * h, w / 40, h / 30];
+        const { data } = canvas.getContext('2d').getImageData(...place.map((length) => ratio * length));
+        return new Set(new Uint32Array(data.buffer)).size"""
+    )
+    assert colours > 1
     browser.execute_script(
         """const canvas = document.querySelector('#map canvas'), frame = canvas.getBoundingClientRect();
         const [clientX, clientY] = [frame.left + 0.8 * frame.width, frame.top + 0.2 * frame.height];

@@ -154,11 +154,8 @@ def stages(groups: list[list[tuple[str, Scene, np.ndarray, Frame[np.ndarray]]]])
     for group in groups:
         _, scene, _, first = group[0]
         ground = arena_of(scene, [frames for *_, frames in group], first.normal[0])
-        shows = views.distinguished_by_colour(
-            tuple(
-                show(of_run, times, frames, number + k, name) for k, (name, of_run, times, frames) in enumerate(group)
-            )
-        )
+        drawn = enumerate(group, number)
+        shows = tuple(show(of_run, times, frames, k, name) for k, (name, of_run, times, frames) in drawn)
         all_stages.append(views.Stage("; ".join(show.name for show in shows), ground, shows))
         number += len(group)
     return all_stages
@@ -379,13 +376,14 @@ class Panel(NamedTuple):
     ends: Values
 
 
-def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
+def draw_launches(panels: list[Panel], angle: float, dots: str, unit: str = "rad") -> Any:
     """Draw theta(t) of every launch, a panel for each arena and place.
 
     **Arguments:**
 
     - `panels`: the panels; `ends` are the times [s] that get a dot, if finite.
-    - `angle`: angle [rad] that counts as inverted; `dots`: description of the dots, below the plot.
+    - `angle`: angle [rad] that counts as inverted; `dots`: description of the dots, below the plot; `unit`: "rad" or "deg",
+      that of the vertical axis.
 
     **Returns:** a matplotlib figure.
     """
@@ -404,8 +402,8 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
         drawing.axhline(angle, color="0.5", linewidth=0.8, linestyle="--")
         drawing.set_title(panel.title)
         drawing.set_xlabel("time [s]")
-        drawing.set_yticks([0.0, np.pi / 2.0, np.pi], ["0", "π/2", "π"])
-    drawings[0].set_ylabel("θ, angle from the normal to the stem [rad]")
+        drawing.set_yticks([0.0, np.pi / 2.0, np.pi], ["0", "π/2", "π"] if unit == "rad" else ["0", "90", "180"])
+    drawings[0].set_ylabel(f"θ, angle from the normal to the stem [{unit}]")
     figure.supxlabel(dots, fontsize=10)
     if len(panels[-1].starts) > 1:
         drawings[-1].legend(title="θ(0) [rad]", loc="center left", bbox_to_anchor=(1.01, 0.5))

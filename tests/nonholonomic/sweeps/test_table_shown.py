@@ -71,8 +71,9 @@ def test_axes_labels_and_units_are_chosen(table):
     lines = table.plot(x="mu", at={"spin": 70.0}, label="a top", unit="deg").axes[0]
     assert (lines.get_xlabel(), lines.get_ylabel()) == ("friction μ [s/m]", "inversion time [s]")
     texts = [text.get_text() for text in lines.get_legend().get_texts()]
-    assert texts == [f"a top, θ(0) = {theta:.4g} deg" for theta in np.degrees(THETA)]
-    assert_close(lines.get_lines()[2].get_xydata(), np.stack([MU, table.time[2, :, 1]], axis=-1))
+    assert texts == [*(f"a top, θ(0) = {theta:.4g} deg" for theta in np.degrees(THETA)), "not inverted"]
+    (third,) = (line for line in lines.get_lines() if line.get_label() == texts[2])
+    assert_close(third.get_xydata(), np.stack([MU, table.time[2, :, 1]], axis=-1))
     chart = table.plot(x="spin", y="theta", unit=["deg", "rpm"], label="a top").axes[0]
     assert (chart.get_xlabel(), chart.get_ylabel()) == ("spin [rpm]", "θ(0) [deg]")
     assert chart.get_title() == "a top, friction μ = 0.1 s/m"
@@ -107,18 +108,23 @@ def test_lines_without_a_time_say_why_they_are_empty():
     assert axes.get_xlim() == (SPIN[0], SPIN[2])
 
 
-@pytest.mark.parametrize(("corner", "sign"), [("lower left", 1.0), ("upper left", -1.0)])
-def test_the_legend_of_a_map_lies_where_times_are_missing(corner, sign):
-    x, y = np.arange(12.0), sign * np.arange(14.0)
-    has_time = (x[:, None] > 5.0) | (abs(y) > 6.0)
+def test_cells_without_a_time_are_marked_and_named():
+    """At the bottom of lines, in the colour of their line; in maps by greys, whose names cover no cell."""
+    has_time = np.arange(12)[:, None] > np.array([3, 6])
     variables = {"time": np.where(has_time, 1.0, np.inf), "status": np.where(has_time, "inverted", "not_inverted")}
-    table = Table({"x": x, "y": y}, variables, {"time": "s"}, {})
-    legend = table.plot().axes[0].get_legend()
-    legend.figure.draw_without_rendering()
-    axes = legend.axes
-    middle = axes.transAxes.inverted().transform(legend.get_window_extent().get_points().mean(axis=0))
-    place = f"{'lower' if middle[1] < 0.5 else 'upper'} {'left' if middle[0] < 0.5 else 'right'}"
-    assert place == corner
+    lines = Table({"x": np.arange(12.0), "y": np.arange(2.0)}, variables, {"time": "s"}, {}).plot().axes[0]
+    assert [text.get_text() for text in lines.get_legend().get_texts()] == ["y = 0", "y = 1", "not inverted"]
+    first, first_marks, second, second_marks, _ = lines.lines
+    for line, marks, count in ((first, first_marks, 4), (second, second_marks, 7)):
+        heights = np.asarray(marks.get_ydata())
+        np.testing.assert_array_equal(np.isfinite(heights), np.isnan(line.get_ydata()))
+        assert (np.sum(np.isfinite(heights)), marks.get_color()) == (count, line.get_color())
+        assert np.all(heights[:count] < 0.1)
+    variables = {name: np.tile(values[:, :1], 14) for name, values in variables.items()}
+    axes = Table({"x": np.arange(12.0), "y": np.arange(14.0)}, variables, {"time": "s"}, {}).plot().axes[0]
+    axes.figure.draw_without_rendering()
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["not inverted"]
+    assert axes.get_legend().get_window_extent().y1 <= axes.xaxis.label.get_window_extent().y0 + 1.0
 
 
 def test_the_end_of_the_name_of_an_axis_is_enough(table):

@@ -12,7 +12,7 @@ from own_modes import Pendulum, Sleigh
 from scipy.spatial.transform import Rotation
 
 import nonholonomic
-from nonholonomic import AbstractMode, Hybrid, simulate
+from nonholonomic import AbstractMode, AbstractSystem, Hybrid, simulate
 from nonholonomic.runs import model_of
 from nonholonomic.runs.trajectory import Trajectory, drawn_by, page_of
 from nonholonomic.views import Ball, Box, Disc, Line, Wheel
@@ -57,6 +57,34 @@ def test_components_of_unlike_size_have_scales_of_their_own():
     (_, _, height), (_, _, speed) = run.stages()[0].arena.axes
     assert height > 4.0 * speed
     assert simulate(Hybrid([Bouncing()]), [1.0, 0.0, 0.0], 1.0).stages()[0].title == "Ball: y1 over y0"
+
+
+def test_a_rate_has_a_scale_of_its_own_and_places_have_one():
+    """The plane of an angle and its rate is a square; the arc of a pendulum in x and y keeps its shape."""
+    (_, _, angle), (_, _, rate) = simulate(Pendulum(), ([1.0], [0.0]), 3.0).stages()[0].arena.axes
+    assert 2.0 < angle / rate < 4.0
+    named = type("Falling", (Decay,), {"names": ("x", "y"), "field": lambda self, t, y: -y * jnp.array([1.0, 3.0])})
+    (_, _, x), (_, _, y) = simulate(Hybrid([named()]), [6.0, 1.0], 3.0).stages()[0].arena.axes
+    assert x == y
+
+
+class Rod(AbstractSystem):
+    """A mass on a rod about the origin, which no start may move along the rod."""
+
+    dimension, names = 2, ("x", "y")
+
+    def metric(self, q):
+        return jnp.eye(2)
+
+    def constraints(self, q):
+        return q[None]
+
+
+def test_default_sliders_allow_runs_and_name_the_component():
+    live, _ = page_of(model_of(Rod(), ([0.6, -0.8], [0.0, 0.0])), None, 1.0)
+    assert [slider.label for slider in live.sliders] == ["x at the start", "y at the start"]
+    live, _ = page_of(model_of(Sleigh(), SLEIGH), None, 1.0)
+    assert [slider.label for slider in live.sliders] == ["mass", "inertia", "ahead"]
 
 
 def test_parts_have_their_places_and_rotations():
@@ -185,7 +213,7 @@ def test_one_component_is_drawn_on_a_line():
     (stage,) = simulate(Hybrid([Decay()]), [1.0], 1.0).stages()
     assert (stage.title, [name for name, _, _ in stage.arena.axes]) == ("Decay: y0", ["y0"])
     points = stage.shows[0].traces[0].points
-    np.testing.assert_allclose((points[0], points[-1]), [[1.0, 0.0, 0.04], [-1.0, 0.0, 0.04]])
+    np.testing.assert_allclose((points[0], points[-1]), [[1.0, 0.0, 0.05], [-1.0, 0.0, 0.05]])
 
 
 def test_a_drawing_without_extent_has_a_size():

@@ -24,12 +24,10 @@ from nonholonomic.views import (
     Trace,
     arena,
     ball,
-    distinguished_by_colour,
     page,
     turned,
 )
-from nonholonomic.views.pages import Viewable
-from nonholonomic.views.plot import draw_curves
+from nonholonomic.views.pages import Viewable, draw_curves
 
 SURFACES = (
     (Plane(), (0.3, 0.1)),
@@ -268,10 +266,3 @@ def test_a_page_without_motion_has_no_script(tmp_path):
     assert "a &lt; b" in text
     assert "<p>words</p>" in text
     assert "<script" not in text
-
-
-def test_traces_of_several_runs_have_their_colours():
-    (show,) = rolling().shows
-    assert distinguished_by_colour((show,)) == (show,)
-    drawings = distinguished_by_colour((show, show._replace(colour=0x2A6FB0)))
-    assert [drawing.traces[0].colour for drawing in drawings] == [0xC8412B, 0x2A6FB0]

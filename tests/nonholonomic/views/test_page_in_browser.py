@@ -6,12 +6,13 @@ import time
 import numpy as np
 import pytest
 from browser import complaints, needs_browser, open_browser, wait
+from own_modes import Pendulum
 
 import stroller
 import tippe
-from nonholonomic.views import COLOURS, css, page
-from nonholonomic.views.pages import ANGLE
-from nonholonomic.views.stage import curves_in
+from nonholonomic import simulate
+from nonholonomic.views import COLOURS, page
+from nonholonomic.views.stage import css, curves_in
 
 pytestmark = needs_browser
 
@@ -111,17 +112,16 @@ def test_the_camera_keeps_all_runs_of_a_place_in_sight(browser):
     """They are 6 m apart in the end, and a vehicle is 0.7 m long."""
     for time_in_page in (0.0, 0.5, 1.0):
         browser.execute_script(f"player.seek({time_in_page!r})")
-        camera, target = np.array(
-            browser.execute_script(
-                "const { camera, controls } = player.stages[1];"
-                "return [camera.position.toArray(), controls.target.toArray()]"
-            )
+        camera, target, angle = browser.execute_script(
+            "const { camera, controls } = player.stages[1];"
+            "return [camera.position.toArray(), controls.target.toArray(), camera.fov]"
         )
+        camera, target = np.array([camera, target])
         view_direction = (target - camera) / np.linalg.norm(target - camera)
         for run in (0, 1):
             matrix = browser.execute_script(f"return player.matrix(1, {run}, 0)")
             view_offset = np.array(matrix).reshape(4, 4)[3, :3] - camera
-            assert view_offset @ view_direction / np.linalg.norm(view_offset) > np.cos(np.radians(ANGLE / 2.0))
+            assert view_offset @ view_direction / np.linalg.norm(view_offset) > np.cos(np.radians(angle / 2.0))
 
 
 CENTRES = """
@@ -399,6 +399,41 @@ def test_in_the_dark_the_page_is_dark_and_its_texts_are_read(browser):
     )
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     assert filters == ["invert(0.9) hue-rotate(180deg)", "invert(1) hue-rotate(180deg)", "none"]
+
+
+def test_the_plane_of_an_own_system_fills_the_picture(browser, tmp_path):
+    """With all labels in the picture, none over another, also in a narrow one."""
+    run = simulate(Pendulum(), ([1.0], [0.0]), 1.0)
+    for width in (400, 1000):
+        with opened(browser, page(run.stages(), "Own", height=300, autoplay=False), tmp_path / "own.html", width):
+            browser.get((tmp_path / "own.html").as_uri())
+            wait(browser, "return !!window.player")
+            corners, labels = browser.execute_script(
+                "const [{ camera, fact, THREE, labels, box }] = player.stages, inside = box.getBoundingClientRect();"
+                "const { x, y, width, height } = inside, { vertices } = fact.arena;"
+                "const corners = [0, 3, 6, 9].map((k) => new THREE.Vector3().fromArray(vertices, k).project(camera));"
+                "return [corners.map((at) => [at.x, at.y]), [...labels.children].map((one) => one.getBoundingClientRect())"
+                ".map((one) => [one.left - x, one.right - x, one.top - y, one.bottom - y])"
+                ".map(([a, b, c, d]) => [a / width, b / width, c / height, d / height])]"
+            )
+            spans = np.ptp(np.array(corners), axis=0)
+            assert np.max(np.abs(corners)) < 0.9
+            assert spans[0] > 1.2 or spans[1] > 1.3
+            assert len(labels) > 6
+            assert np.min(labels) > 0.0
+            assert np.max(labels) < 1.0
+            for k, (left, right, top, bottom) in enumerate(labels):
+                for a, b, c, d in labels[:k]:
+                    # The boxes of texts are larger than their letters.
+                    assert min(right - a, b - left) < 0.02 or min(bottom - c, d - top) < 0.02
+
+
+def test_traces_of_several_runs_have_their_colours(browser, stages):
+    colours = browser.execute_script(
+        "return player.stages[1].runs.map(({ traces }) => `#${traces[0].line.material.color.getHexString()}`)"
+    )
+    assert colours == [css(show.colour) for show in stages[1].shows]
+    assert stages[1].shows[0].traces[0].colour != stages[1].shows[0].colour
 
 
 def test_a_page_asks_for_nothing_from_elsewhere(browser, stages, tmp_path):
