@@ -1,5 +1,6 @@
 """Branches of periodic orbits over a number, with their special points (`runs/continuation.py` follows them)."""
 
+import itertools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,7 +18,7 @@ from ..terminal import status_line
 from ..text import counted, shown
 from ..validation import require, require_outside, require_package, require_whole
 from ..views.plot import new_figure
-from .continuation import ASIDE, CROSSING, DIVERGES, DOUBLING, ENDS, REGULAR, STEPS, Continuation, Point
+from .continuation import ASIDE, CROSSING, DIVERGES, DOUBLING, ENDS, OF_A_FAMILY, REGULAR, STEPS, Continuation, Point
 
 # Only for type checkers: xarray is optional, and an orbit knows how to branch.
 if TYPE_CHECKING:
@@ -200,12 +201,14 @@ class Branch(eqx.Module):
         figure: Any = new_figure() if ax is None else None
         panel: Any = ax if figure is None else figure.subplots()
         x, y, stable = table["value"], table[quantity], np.asarray(self.stable)
-        for is_stable, style in ((True, "-"), (False, "--")):
-            # Each stretch between two points has the stability of both; at its end an orbit may count as either.
-            inside = [k for k in range(len(x) - 1) if (stable[k] | stable[k + 1]) == is_stable]
-            gaps = np.full(len(inside), np.nan)
-            lines = [np.column_stack([part[inside], part[[k + 1 for k in inside]], gaps]).ravel() for part in (x, y)]
-            panel.plot(*lines, style, color="C0", label=("stable" if is_stable else "unstable") if inside else None)
+        # At the end of a stable stretch an orbit may count as unstable.
+        edges = stable[:-1] | stable[1:]
+        starts = [0, *(np.flatnonzero(np.diff(edges)) + 1), len(edges)]
+        for begin, end in itertools.pairwise(starts):
+            label = "stable" if edges[begin] else "unstable"
+            named = label in panel.get_legend_handles_labels()[1]
+            part, style = slice(begin, end + 1), "-" if edges[begin] else "--"
+            panel.plot(x[part], y[part], style, color="C0", label=None if named else label)
         for k, kind in enumerate(self.kinds):
             if kind != REGULAR:
                 panel.plot(x[k], y[k], "o", color="C3", markersize=4)
@@ -239,6 +242,8 @@ def continuation_of(
         )
     if orbit.search is None or int(orbit.reason):
         raise ValueError("branch needs an orbit that periodic_orbit has found in this process")
+    if int(orbit.family) and len(orbit.search.free) == len(orbit.names):
+        raise ValueError(OF_A_FAMILY)
     require(until, "until")
     search, model = orbit.search, orbit.search.model(orbit.leaves)
     parameters = model.parameters

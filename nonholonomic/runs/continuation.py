@@ -57,6 +57,13 @@ NO_SIGN = 1e-9
 #: Singular values of the Jacobian by the unknowns below this, as a part of the largest, belong to a family of orbits.
 RANK = 1e-7
 
+OF_A_FAMILY = (
+    "the orbit is one of a family, for a fixed number; pass free= to periodic_orbit, so that it is the only one"
+)
+
+#: Singular values below this, as a part of the largest, are round-off.
+ROUND_OFF = 1e-10
+
 #: A predicted state this near the section, in units of the time of a return, is moved onto it.
 NEAR = 0.05
 
@@ -227,7 +234,7 @@ class Continuation(NamedTuple):
             if new.reason > 0 or not np.isfinite(matrix).all():
                 return int(new.reason) or DIVERGES
             miss, rows = (new.state - new.start) / self.scale, np.vstack([matrix, tangent])
-            change = np.linalg.lstsq(rows, np.append(miss, tangent @ (guess - unknowns)), rcond=None)[0]
+            change = np.linalg.lstsq(rows, np.append(miss, tangent @ (guess - unknowns)), rcond=ROUND_OFF)[0]
             unknowns = unknowns + change
             size = max(1.0, float(np.abs(new.by_state).max()))
             if max(np.abs(miss).max() / size, np.abs(change).max() * tolerance**0.5) <= CONVERGED * tolerance:
@@ -322,14 +329,12 @@ class Continuation(NamedTuple):
         """The points of the branch, their kinds, and why it ends. **Arguments:** `step`: largest, as a part of the range of the
         number; `count`: number of points."""
         begin = self.begin
+        singular = np.linalg.svd(self.linearized(begin)[1], compute_uv=False)
+        if singular[len(begin) - 2] <= RANK * max(1.0, singular[0]):
+            raise ValueError(OF_A_FAMILY)
         start = self.corrected(begin, np.eye(len(begin))[-1])
         if isinstance(start, int):
             raise ValueError(f"the orbit: there is no branch from {self.first:.10g}: {ENDS[start]}")
-        singular = np.linalg.svd(start.matrix, compute_uv=False)
-        if singular[len(begin) - 2] <= RANK * max(1.0, singular[0]):
-            raise ValueError(
-                "the orbit is one of a family, for a fixed number; pass free= to periodic_orbit, so that it is the only one"
-            )
         points, kinds, length, is_free = [start], [REGULAR], 0.25 * step, True
         problem = 0
         while len(points) < count:

@@ -269,6 +269,10 @@ class OrbitSolve(AbstractDifferentiableSolve):
         starts = tuple(k for k, name in enumerate(names, 1) if name.startswith("start"))
         return (cls(1 + event.movable, event, starts, *options), t1, *numbers, tolerance)
 
+    def __reduce__(self) -> tuple[type[None], tuple[()]]:
+        # A user's classes may not be pickled, but the numbers of an orbit can.
+        return type(None), ()
+
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.zeros(jnp.shape(value), bool)
 

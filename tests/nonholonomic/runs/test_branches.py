@@ -1,11 +1,14 @@
 """Branches of periodic orbits against closed forms and published values."""
 
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from nonholonomic import AbstractMode, Hybrid, Table, periodic_orbit
+from nonholonomic.runs.continuation import is_rotating
 
 
 class Iterated(AbstractMode):
@@ -54,6 +57,11 @@ def test_the_logistic_map_doubles_its_period(tmp_path):
     again = doubled.switched().branch("growth", 3.55)
     np.testing.assert_allclose(again.special[0].value, 3.5440903595519, atol=1e-8)
 
+    kept = pickle.loads(pickle.dumps(branch))
+    np.testing.assert_array_equal(kept.states, branch.states)
+    with pytest.raises(ValueError, match="an orbit that periodic_orbit has found in this process"):
+        kept.switched()
+
     lines = repr(again).splitlines()
     assert lines[0].startswith("branch of periodic orbits over growth, ")
     assert "  period doubling at growth = 3.544090359, period 4 s" in lines
@@ -65,8 +73,11 @@ def test_the_logistic_map_doubles_its_period(tmp_path):
     assert branch.to_xarray()["multipliers_real"].dims == ("point", "multiplier")
     (panel,) = branch.plot("y0").axes
     assert [text.get_text() for text in panel.texts] == ["period doubling"]
-    solid, dashed = (line.get_xdata() for line in panel.lines[:2])
-    assert np.nanmax(solid) <= 3.0 + 1e-8 <= np.nanmin(dashed) + 2e-8
+    solid, dashed, _ = panel.lines
+    assert [solid.get_linestyle(), dashed.get_linestyle()] == ["-", "--"]
+    # Each in one piece, so that dashes show.
+    np.testing.assert_allclose([solid.get_xdata()[0], solid.get_xdata()[-1]], [2.9, 3.0], atol=1e-8)
+    np.testing.assert_allclose([dashed.get_xdata()[0], dashed.get_xdata()[-1]], [3.0, 3.2], atol=1e-8)
 
 
 def test_a_fold_a_torus_and_a_branch_point():
@@ -74,33 +85,47 @@ def test_a_fold_a_torus_and_a_branch_point():
     logistic map have the product growth - 1. Without a shift, x = 0 and x = 1 - 1 / growth meet at 1."""
     folded = fixed(3.0, 0.6, shift=-0.125).branch("growth", 1.0)
     torus = fixed(1.8, 0.4, delayed=1.0).branch("growth", 2.1)
-    crossed = fixed(2.0, 0.5).branch("growth", 0.8)
+    crossed = fixed(2.0, 0.5).branch("growth", 0.5)
     for branch, kind, value in ((folded, "fold", 2.0), (torus, "Neimark-Sacker", 2.0), (crossed, "branch point", 1.0)):
         assert [point.kind for point in branch.special] == [kind]
         np.testing.assert_allclose(branch.special[0].value, value, atol=1e-9)
+    # Real multipliers whose product is 1 are no torus.
+    assert [is_rotating(np.array(pair)) for pair in ([0.6 + 0.8j, 0.6 - 0.8j], [2.0, 0.5 + 0.0j])] == [True, False]
     # Around the fold, back to the first value.
     np.testing.assert_allclose(folded.values[-1], 3.0, rtol=1e-12)
     np.testing.assert_allclose(folded.states[-1, 0], (2.0 - np.sqrt(2.5)) / 6.0, atol=1e-10)
     assert folded.end == "the number reaches its first value again"
-    np.testing.assert_allclose(crossed.states[-1, 0], 1.0 - 1.0 / 0.8, atol=1e-10)
+    np.testing.assert_allclose(crossed.states[-1, 0], -1.0, atol=1e-10)
     other = crossed.switched().branch("growth", 1.5)
     np.testing.assert_allclose(other.states[:, 0], 0.0, atol=1e-12)
 
 
-class Obstacle(AbstractMode):
-    """A driven oscillator beside a wall."""
+class Apart(AbstractMode):
+    """A driven oscillator beside a soft stop."""
 
     frequency: float
-    wall: float = 1.0
+    stop: float = 1.0
+    stiffness: float = 5.0
 
     def field(self, t, y):
         return jnp.array([y[1], jnp.cos(self.frequency * t) - y[0] - 0.4 * y[1]])
 
     def margin(self, t, y):
-        return self.wall - y[0]
+        return self.stop - y[0]
 
     def reset(self, t, y):
-        return jnp.array([self.wall, -0.8 * y[1]]), 0
+        return y, 1
+
+
+class Pressed(Apart):
+    def field(self, t, y):
+        return super().field(t, y) - jnp.array([0.0, self.stiffness * (y[0] - self.stop)])
+
+    def margin(self, t, y):
+        return y[0] - self.stop
+
+    def reset(self, t, y):
+        return y, 0
 
 
 def period_of_drive(frequency):
@@ -109,7 +134,7 @@ def period_of_drive(frequency):
 
 def test_a_driven_branch_ends_where_it_grazes():
     """The amplitude 1 / |1 - w^2 + 0.4 i w| is 1 at w^2 = 1.84."""
-    orbit = periodic_orbit(Hybrid([Obstacle(1.6)]), [0.0, 0.0], period=period_of_drive(1.6))
+    orbit = periodic_orbit(Hybrid([Apart(1.6), Pressed(1.6)]), [0.0, 0.0], period=period_of_drive(1.6))
     branch = orbit.branch("frequency", 1.2, period=period_of_drive)
     frequencies = np.asarray(branch.values)
     amplitude = 1.0 / (1.0 - frequencies**2 + 0.4j * frequencies)

@@ -211,6 +211,10 @@ def test_an_orbit_of_a_family():
     assert orbit.family == 1
     assert orbit.stable
     assert "family" in repr(orbit)
+    with pytest.raises(
+        ValueError, match="the orbit is one of a family, for a fixed number; pass free= to periodic_orbit"
+    ):
+        orbit.branch("length", 2.0)
 
     # Two multipliers 1 of one family of driven orbits, split by round-off.
     driven = periodic_orbit(Pendulum(), ([1.0], [0.0]), period=float(orbit.period))
