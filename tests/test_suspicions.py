@@ -62,6 +62,7 @@ SUSPECTED = {
         "mu = 27 is large: was it in %? 27 % are 0.27",
     ),
     "exact friction in per cent": (lambda: tippe.SetValuedCoulomb(27.0), "mu = 27 is large"),
+    "wheelbases in mm": (lambda: stroller.Stroller(12.0, [700.0, 800.0], 1.5, 0.05), "was it in mm or cm? 800 mm are"),
     "a slip speed in mm/s": (
         lambda: tippe.Contensou(0.3, 1e-3, 50.0),
         "slip_speed = 50 m/s is large: was it in mm/s? 50 mm/s are 0.05 m/s",
@@ -229,6 +230,11 @@ def test_what_is_usual_is_not_suspected(nothing_runs):
     tippe.Launch(2.5, 155.0)
     tippe.Launch(2.0, 0.0)
     tippe.Coulomb(0.1, 0.2)
+    tippe.Coulomb(0.0, 0.3)
+    # Samples that are missing may have any errors.
+    tippe.Recording(LAUNCH, [0.1, 0.2], [0.1, np.nan], [0.01, np.inf])
+    columns = {"value": [[0.1, np.nan]], "error": [[0.01, np.nan]]}
+    tippe.Recording(LAUNCH, [0.1], **columns, quantity=("theta", "eta"))
     stroller.Stroller(5.0, 0.25, 0.1, 0.005)
     tippe.Scene(rutstam_top(), tippe.Cylinder(10.0))
     stroller.Launch((0.0, 0.0), 6.2, 1.0, steering=-1.5)

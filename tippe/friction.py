@@ -117,7 +117,7 @@ class AbstractFriction(Bounded):
         if not is_own:
             return None if is_traced(self) else drive(as_law(self))
         mu, speed = (largest(getattr(self, name, 0.0)) for name in ("mu", "slip_speed"))
-        if max(USUAL_SLIP_SPEED, mu) < speed <= GREATEST_SLIP_SPEED:
+        if mu and max(USUAL_SLIP_SPEED, mu) < speed <= GREATEST_SLIP_SPEED:
             return f"slip_speed = {speed:g} m/s > mu = {mu:g}: were they exchanged? {ADVICE['slip_speed']}"
         return super().suspicion()
 

@@ -199,9 +199,9 @@ class AbstractRecording(AbstractData):
             if np.ndim(self.student) != 0:
                 raise ValueError(f"student must be one number, not of shape {np.shape(self.student)}")
         # Unusual units: samples too far apart for seconds, and angles too large for radians.
-        errors = np.zeros(shape) if self.error is None else np.broadcast_to(self.error, shape)
+        errors = np.where(seen, 0.0 if self.error is None else self.error, 0.0)
         for k, name in enumerate(self.columns):
-            largest = np.nanmax(errors.reshape(len(times), -1)[:, k])
+            largest = np.max(errors.reshape(len(times), -1)[:, k])
             if self.quantities.units.get(name) == "rad" and largest > LARGE_ERROR:
                 warn(f"error of {name} = {largest:g} rad is large{IN_DEGREES.format(f'{largest:g}')}")
         if self.quantities.usual and len(times) > 1 and (apart := np.median(np.diff(times))) > FAR_APART:

@@ -80,12 +80,13 @@ class Stroller(Bounded):
     centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None, metadata=Bound.NOT_NEGATIVE)
 
     def suspicion(self) -> str | None:
-        if is_traced(self) or np.ndim(self.mass + self.wheelbase + self.inertia):
-            return None
+        question = super().suspicion()
+        if question or is_traced(self) or np.ndim(self.mass + self.wheelbase + self.inertia):
+            return question
         radius = np.sqrt(np.asarray(self.inertia) / np.asarray(self.mass)) / np.asarray(self.wheelbase)
         is_usual = GYRATION[0] <= radius <= GYRATION[1]
         values = ", ".join(f"{name} = {largest(getattr(self, name)):g}" for name in ("mass", "wheelbase", "inertia"))
-        return super().suspicion() or (None if is_usual else f"{values} do not fit{ODD}")
+        return None if is_usual else f"{values} do not fit{ODD}"
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
