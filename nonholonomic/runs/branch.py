@@ -36,7 +36,12 @@ class SpecialPoint(NamedTuple):
     `kind` is "fold", "period doubling", "Neimark-Sacker" (a complex pair of multipliers passes through the unit circle),
     "branch point" (another branch of orbits crosses), or "grazing" (a margin touches zero).
 
-    **Example:** as for `Orbit.branch`.
+    **Example:** of a branch that you have computed, the multipliers at the period doublings are
+    `[point.orbit.multipliers for point in branch.special if point.kind == "period doubling"]`.
+
+    >>> import nonholonomic
+    >>> nonholonomic.SpecialPoint("fold", 2.0, None)
+    SpecialPoint(kind='fold', value=2.0, orbit=None)
     """
 
     kind: str
