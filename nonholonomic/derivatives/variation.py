@@ -418,16 +418,24 @@ class FramedProblem(AbstractDerivedProblem):
 #: Tangents are orthonormalised before one grows or shrinks by more than e to this power: so much of their digits is lost.
 MOST_GROWTH = 15.0
 
-#: The most intervals in a stretch.
-MOST_INTERVALS = 4096
+#: The most intervals in a stretch; in an interval of this few steps, only a reset can change lengths by so much.
+MOST_INTERVALS, FEW_STEPS = 4096, 6
+
+#: A part of a tangent below this is round-off.
+LOST = 1e-14
 
 
 def orthonormalised(
     tangents: Float[Array, "tangents components cells"],
 ) -> tuple[Float[Array, "tangents cells"], Float[Array, "tangents components cells"]]:
-    """The logarithms of the lengths of tangents, each without its part along those before it, and these parts at length 1."""
+    """The logarithms of the lengths of tangents, each without its part along those before it, and these parts at length 1.
+
+    A part that is only round-off of its tangent has the length zero.
+    """
     frame, factors = jnp.linalg.qr(jnp.moveaxis(tangents, -1, 0).mT)
-    return jnp.log(jnp.abs(jnp.diagonal(factors, axis1=-2, axis2=-1))).T, jnp.moveaxis(frame.mT, 0, -1)
+    lengths = jnp.abs(jnp.diagonal(factors, axis1=-2, axis2=-1)).T
+    lengths = jnp.where(lengths > LOST * jnp.linalg.norm(tangents, axis=1), lengths, 0.0)
+    return jnp.log(lengths), jnp.moveaxis(frame.mT, 0, -1)
 
 
 def in_stretches(
@@ -451,7 +459,7 @@ def in_stretches(
             for interval in range(intervals):
                 begin = number * t1 / stretches + interval * duration
                 logarithm, runs, outcome = advance(runs, begin, duration)
-                alive = np.True_
+                alive, steps = np.True_, outcome.steps
                 if ended is not None:
                     # Runs that had ended stay as they were.
                     alive = np.isin(ended.status, (RUNNING, REACHED_END))
@@ -460,8 +468,8 @@ def in_stretches(
                     outcome = jax.tree.map(lambda new, old: np.where(alive, new, old), outcome._replace(**added), ended)  # noqa: B023
                 ended, logarithm = outcome, np.where(alive, logarithm, 0.0)
                 total = total + logarithm
-                largest = np.max(np.abs(logarithm), initial=0.0, where=np.isfinite(logarithm))
-                if largest > MOST_GROWTH and intervals < MOST_INTERVALS:
+                is_coarse = alive & (steps > FEW_STEPS) & (np.abs(logarithm) > MOST_GROWTH)
+                if is_coarse.any() and intervals < MOST_INTERVALS:
                     intervals *= 2
                     break
             else:

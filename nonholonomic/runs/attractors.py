@@ -146,7 +146,7 @@ class LyapunovSpectrum(NamedTuple):
 
     - `exponents`: mean rates [1/s] in the second half of the run, (n,), the largest first: volumes of k dimensions grow at the
       sum of the first k. `errors`: their errors [1/s].
-    - `sum`: of all exponents [1/s], with its error `sum_error`.
+    - `sum`: of these exponents [1/s], with its error `sum_error`.
     - `status`, `end_time`, `steps`, `times`: as for `LyapunovExponent`; `running`: the mean rates from the start to each of
       the times, (32, n).
 
@@ -251,8 +251,10 @@ def lyapunov_spectrum(
         tangents = tangents[:n]
     logarithm, ended = growth_of_model(model, tangents, t1, settings)
     (status,) = np.asarray(_ended(model, jax.tree.map(jnp.asarray, ended), settings.tolerance))
-    # The sum is averaged as the exponents are.
-    rates, errors = exponent_of(np.concatenate([logarithm[..., 0], logarithm.sum(axis=1)], axis=1), t1)
+    # Directions that a reset takes away do not come back. The sum is averaged as the exponents are.
+    logarithm = np.where(np.logical_or.accumulate(np.isneginf(logarithm)), -np.inf, logarithm)
+    with np.errstate(invalid="ignore"):
+        rates, errors = exponent_of(np.concatenate([logarithm[..., 0], logarithm.sum(axis=1)], axis=1), t1)
     if status != Status.COMPLETED:
         rates, errors = np.full((2, len(rates)), np.nan)
     times, end = t1 * np.arange(1, STRETCHES + 1) / STRETCHES, float(ended.end_time[0])
@@ -451,6 +453,9 @@ class Ranges(Samples):
 #: Number of samples in each quarter of a run.
 SAMPLED = 250
 
+#: Differences below this, in units of the tolerance and of the quantity, may be errors of the integration.
+ERRORS = 10.0
+
 
 @explaining
 def basins(
@@ -536,13 +541,13 @@ def basins(
     table = table_of(model, named, float(t1), "first", options, TableForm(), samples=samples, timed=False)
     return dataclasses.replace(
         table,
-        variables={"attractor": attractors_of(table, tuple(names), resolution), **table.variables},
+        variables={"attractor": attractors_of(table, tuple(names), resolution, tolerance), **table.variables},
         units=table.units | {"attractor": "1"},
         long_names=table.long_names | {"attractor": "attractor"},
     )
 
 
-def attractors_of(table: Table, names: tuple[str, ...], resolution: float) -> Int[np.ndarray, "..."]:
+def attractors_of(table: Table, names: tuple[str, ...], resolution: float, tolerance: float) -> Int[np.ndarray, "..."]:
     """The number of the attractor of each cell."""
     # SciPy's trees are imported only here.
     from scipy.sparse import coo_array
@@ -557,8 +562,9 @@ def attractors_of(table: Table, names: tuple[str, ...], resolution: float) -> In
         if not completed.any():
             break
         low, high = np.quantile(least[completed], 0.01), np.quantile(greatest[completed], 0.99)
-        # All runs of a quantity that does not change have one value.
-        step = resolution * (max(high - low, np.median(whole[completed])) or 1.0)
+        # Errors of the integration are no differences, and all runs of a quantity that does not change have one value.
+        errors = ERRORS * tolerance * max(abs(low), abs(high))
+        step = max(resolution * (max(high - low, np.median(whole[completed])) or 1.0), errors)
         has_settled &= change <= step
         rows += [part / step for part in (least, greatest)]
     number = np.zeros(np.shape(completed), int)

@@ -228,9 +228,11 @@ class Branch(eqx.Module):
         stable = np.asarray(self.stable)
         count = counted(len(values), "point")
         lines = [f"branch of periodic orbits over {name}, {count} from {values[0]:.8g} to {values[-1]:.8g}"]
-        starts = [0, *(np.flatnonzero(np.diff(stable)) + 1)]
-        for begin, end in zip(starts, [*starts[1:], len(values) - 1], strict=True):
-            lines.append(f"{'stable' if stable[begin] else 'unstable'} from {values[begin]:.8g} to {values[end]:.8g}")
+        changes = [0, *(np.flatnonzero(np.diff(stable)) + 1)]
+        # At a special point, an orbit may count as either.
+        starts = [k - (k > 0 and self.kinds[k - 1] != REGULAR) for k in changes]
+        for k, begin, end in zip(changes, starts, [*starts[1:], len(values) - 1], strict=True):
+            lines.append(f"{'stable' if stable[k] else 'unstable'} from {values[begin]:.8g} to {values[end]:.8g}")
         for kind, value, orbit in self.special:
             lines.append(f"{kind} at {name} = {value:.10g}, period {float(orbit.period):.8g} s")
         return "\n  ".join([*lines, f"ended because {self.end}"])

@@ -99,10 +99,12 @@ def test_the_basins_of_a_cycle_and_of_a_point_of_rest(tmp_path):
 
 
 class Decay(AbstractMode):
+    """Decay, beside a component that only noise changes."""
+
     rate: float
 
     def field(self, t, y):
-        return -self.rate * y
+        return jnp.array([-self.rate * y[0], 1e-12 * jnp.sin(3.0 * t)])
 
     def margin(self, t, y):
         return 2.0 - y[0]
@@ -111,7 +113,7 @@ class Decay(AbstractMode):
 def test_a_run_that_has_not_settled_or_cannot_start_has_no_attractor():
     axes = {"rate": [0.01, 1.0, 2.0, 1.0], "start[0]": [1.0, 1.0, 1.0, 2.5]}
     with pytest.warns(UserWarning, match="1 of 4 cells are illegal"):
-        table = nonholonomic.basins(Hybrid([Decay(1.0)]), [1.0], 60.0, axes=axes, scattered=True, progress=False)
+        table = nonholonomic.basins(Hybrid([Decay(1.0)]), [1.0, 5.0], 60.0, axes=axes, scattered=True, progress=False)
     assert table.attractor.tolist() == [0, 1, 1, 0]
     assert table.status.tolist() == ["completed", "completed", "completed", "illegal"]
 

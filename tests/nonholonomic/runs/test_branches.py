@@ -46,6 +46,9 @@ def test_the_logistic_map_doubles_its_period(tmp_path):
     assert [point.kind for point in branch.special] == ["period doubling"]
     np.testing.assert_allclose(branch.special[0].value, 3.0, atol=1e-10)
     np.testing.assert_allclose(branch.values[-1], 3.2, rtol=1e-12)
+    # The other way, too, the orbit changes its stability at the special point.
+    backward = repr(fixed(3.1, 1.0 - 1.0 / 3.1).branch("growth", 2.9))
+    assert "  unstable from 3.1 to 3\n  stable from 3 to 2.9\n" in backward
 
     doubled = branch.switched().branch("growth", 3.6)
     assert doubled.orbit(0).returns == 2

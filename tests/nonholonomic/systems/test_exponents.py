@@ -114,3 +114,18 @@ class Decay(AbstractMode):
 
     def field(self, t, y):
         return jnp.array([0.0 * y[0], -self.rate * y[1]])
+
+
+class Merging(Cat):
+    """Once a second, two components become 0.4 x + 0.3 y and twice that, so that a direction is lost but for round-off."""
+
+    def reset(self, t, y):
+        merged = 0.4 * y[0] + 0.3 * y[1]
+        return jnp.array([merged, 2.0 * merged + 0.0 * y[1], 0.0, y[3]]), 0
+
+
+def test_a_direction_that_resets_take_away_has_no_finite_exponent():
+    """The map has the eigenvalues 1 and 0."""
+    result = lyapunov_spectrum(Hybrid([Merging(0.5)]), [0.3, 0.2, 0.5, 1.0], t1=40.0, tolerance=1e-8)
+    assert_close(result.exponents, [0.0, 0.0, -0.5, -np.inf], atol=1e-6)
+    assert result.sum == -np.inf
