@@ -151,7 +151,8 @@ def fitted(points: Points, weights: PerPoint, components: int, random: np.random
         chosen.append(int(random.choice(len(points), p=squares / np.sum(squares))))
     centres = points[chosen]
     shares, covariances = np.full(len(centres), 1.0 / len(centres)), np.tile(whole / len(centres), (len(centres), 1, 1))
-    effective = 1.0 / np.sum(weights**2)
+    # The points of a single unknown are a grid, on which few resolve a component.
+    effective = 1.0 / np.sum(weights**2) if size > 1 else len(points)
     for _ in range(ITERATIONS):
         logs = Mixture(shares, centres, np.linalg.cholesky(covariances)).log_normals(points)
         parts = np.exp(logs - np.logaddexp.reduce(logs, axis=0)) * weights

@@ -9,7 +9,15 @@ import scipy.stats
 
 from nonholonomic.identification import FitWarning, Free, LogDensity, Measurements, identify, sample
 from nonholonomic.identification.conclusions import Distribution
-from nonholonomic.identification.exploration import EVEN, FREEDOM, Mixture, independent_number, smoothed_weights
+from nonholonomic.identification.exploration import (
+    COMPONENTS,
+    EVEN,
+    FREEDOM,
+    Mixture,
+    fitted,
+    independent_number,
+    smoothed_weights,
+)
 
 X = np.linspace(0.5, 1.5, 8)
 TRUTH, ERROR, TOOTH = 2.0, 0.05, 0.1
@@ -133,6 +141,15 @@ def test_draws_of_a_single_unknown_are_spread_evenly():
     places = 0.3 * scipy.stats.t.cdf(draws / 0.5, FREEDOM) + 0.7 * scipy.stats.t.cdf(draws - 2.0, FREEDOM)
     np.testing.assert_allclose(100.0 * places, np.arange(100) + 0.5, atol=2.0)
     assert np.std(100.0 * np.diff(places)) < 0.3
+
+
+def test_proposals_of_a_single_unknown_keep_narrow_minima_apart():
+    """A component over both of two minima, which few points resolve, would draw hardly any points in them."""
+    points = np.concatenate([place + np.linspace(-0.1, 0.1, 24) for place in (-1.0, 1.0)])[:, None]
+    weights = np.exp(-0.5 * ((np.abs(points[:, 0]) - 1.0) / 0.03) ** 2)
+    mixture = fitted(points, weights / np.sum(weights), COMPONENTS, np.random.default_rng(0))
+    assert np.max(mixture.roots) < 0.1
+    assert np.sum(mixture.shares[mixture.centres[:, 0] > 0.0]) == pytest.approx(0.5, abs=0.05)
 
 
 def test_points_of_a_single_unknown_are_worth_more_than_independent_ones_where_the_density_is_smooth():
