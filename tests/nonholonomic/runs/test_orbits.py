@@ -328,7 +328,7 @@ def test_what_is_wrong_is_said():
         periodic_orbit(system, [0.0, 0.8], lambda t, y: y[0] + 5.0, t1=50.0)
     with pytest.raises(ValueError, match="pass the section or the period"):
         periodic_orbit(system, [0.0, 0.8], wall, period=3.0)
-    with pytest.raises(ValueError, match="depend on time"):
+    with pytest.raises(ValueError, match="depends on time"):
         periodic_orbit(Hybrid([Driven(0.2, 1.0)]), [0.0, 0.8], turning)
     top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     with pytest.raises(ValueError, match="crossings runs scenes"):
