@@ -104,7 +104,7 @@ class Decay(AbstractMode):
     rate: float
 
     def field(self, t, y):
-        return jnp.array([-self.rate * y[0], 1e-12 * jnp.sin(3.0 * t)])
+        return jnp.array([-self.rate * y[0], 1e-9 * jnp.sin(1e3 * t)])
 
     def margin(self, t, y):
         return 2.0 - y[0]
