@@ -112,7 +112,9 @@ def drawn_by(model: Any, draw: Draw) -> Any:
     if draw is None:
         return model
     if not callable(draw) or not hasattr(model, "draw"):
-        raise ValueError(f"draw = {shown(draw)} must be a function (system, t, y) for an own system, None for a scene")
+        raise ValueError(
+            f"draw = {shown(draw)} must be a function draw(system, t, y) for your own system, and None for a scene"
+        )
     return dataclasses.replace(model, **{"draw": draw})
 
 
