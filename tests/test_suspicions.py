@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from never_run import LAUNCH, TOP, run_of_nothing
+from never_run import LAUNCH, PRAM, RIDE, TOP, run_of_nothing
 from tops import rutstam_top
 
 import stroller
 import tippe
 from nonholonomic.runs.model import settings_for_lanes
+from stroller.planning.problem import checked_problem
 from tippe.runs.verbs import warn_of_long_runs
 
 pytestmark = pytest.mark.oldest
@@ -131,6 +132,10 @@ SUSPECTED = {
     "degrees of a slope": (
         lambda: stroller.Plane(1.0),
         "tilt = 1 rad is large; angles are in radians: did you mean np.radians(1)?",
+    ),
+    "a goal in cm": (
+        lambda: checked_problem(PRAM, RIDE, stroller.Goal((200.0, 1000.0), 0.0), 10.0),
+        "goal: place = (200.0, 1000.0) is 1018 m from the launch, a mean speed of 102 m/s: was it in cm or mm?",
     ),
     "a grip in per cent": (lambda: stroller.Limits(grip=30.0), "grip = 30 is large: was it in %? 30 % are 0.3"),
     "a mass of a stroller in g": (

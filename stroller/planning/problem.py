@@ -723,9 +723,11 @@ def checked_problem(
     if problem.distance > FARTHEST * float(scene.body.wheelbase):
         away = f"it is {problem.distance:.4g} m from the launch, more than {FARTHEST:.0f} wheelbases"
         raise ValueError(f"goal: place = {shown(goal.place)} is too far: {away}; plan a long way goal by goal")
-    if not in_haste and (speed := problem.distance / duration) > FASTEST:
+    # A limit of the speed is checked by the plan.
+    is_free = not in_haste and limits.speed is None
+    if is_free and (speed := problem.distance / duration) > FASTEST:
         warn(
-            f"goal: place = {shown(goal.place)} is {problem.distance:.3g} m from the launch, a mean speed of {speed:.3g} m/s: "
+            f"goal: place = {shown(goal.place)} is {problem.distance:.0f} m from the launch, a mean speed of {speed:.3g} m/s: "
             "was it in cm or mm? Or take a longer t1"
         )
     for number, (part, frame) in enumerate(problem.standing):
