@@ -135,7 +135,7 @@ SUSPECTED = {
     ),
     "a goal in cm": (
         lambda: checked_problem(PRAM, RIDE, stroller.Goal((200.0, 1000.0), 0.0), 10.0),
-        "goal: place = (200.0, 1000.0) is 1018 m from the launch, a mean speed of 102 m/s: was it in cm or mm?",
+        "goal: place = (200.0, 1000.0) is 1020 m from the launch, a mean speed of 102 m/s: was it in cm or mm?",
     ),
     "a grip in per cent": (lambda: stroller.Limits(grip=30.0), "grip = 30 is large: was it in %? 30 % are 0.3"),
     "a mass of a stroller in g": (

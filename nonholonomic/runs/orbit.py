@@ -670,9 +670,7 @@ def periodic_orbit(
     if period is None:
         require_event(model)
         if model.form.traits.depends_on_time:
-            raise ValueError(
-                "event: functions of the system depend on time; pass period=, that of the drive, in place of event="
-            )
+            raise ValueError("event: the system depends on time; pass period=, that of the drive, in place of event=")
     else:
         model = model.without_event()
     horizon = t1 if period is None else period
