@@ -504,7 +504,7 @@ class Bounded(eqx.Module, metaclass=Explaining):
             lists = ", ".join(f"{name} of shape {shape}" for name, shape in shapes.items() if shape)
             raise ValueError(
                 f"{type(self).__name__}: {lists}: the numbers of one object must be scalars or lists of equal length; "
-                "for a grid of all combinations, use a table, such as inversion_table"
+                "for all combinations, give the lists to a table by name: inversion_table(scene, theta=[...], spin=[...])"
             ) from None
         require_all(self.bounds())
         # Copies that our threads make of the user's modules repeat no warning.

@@ -149,7 +149,9 @@ def test_a_run_tells_whether_the_top_turned_over(run):
 
 def test_a_top_that_fell_back_is_not_called_inverted(run, monkeypatch):
     monkeypatch.setattr(tippe.Trajectory, "inversion_time", 0.4)
-    assert "turned over at 0.4 s, upright again at the end\n" in str(run)
+    assert "turned over at 0.4 s, but fell back\n" in str(run)
+    ((time, words),) = run.marks
+    assert (time, words) == (0.4, "turned over at 0.4 s, fell back")
 
 
 def test_one_time_is_a_time(run):

@@ -312,7 +312,8 @@ class AbstractTrajectory(AbstractRun):
         if self.dense is None or not isinstance(self.scene.body, AbstractBody):
             return ()
         time = self.inversion_time
-        return ((time, f"turned over at {time:.3g} s"),) if np.isfinite(time) else ()
+        fell = ", fell back" if float(self.theta[-1]) < math.pi / 2.0 else ""
+        return ((time, f"turned over at {time:.3g} s{fell}"),) if np.isfinite(time) else ()
 
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:
@@ -371,8 +372,8 @@ class AbstractTrajectory(AbstractRun):
         ]
         if self.dense is not None and isinstance(self.scene.body, AbstractBody):
             words = self._whether_it_turned_over
-            is_upright = words.startswith("turned") and np.asarray(self.theta)[-1] < math.pi / 2.0
-            lines.append(f"  {words}{', upright again at the end' if is_upright else ''}")
+            fell_back = words.startswith("turned") and float(self.theta[-1]) < math.pi / 2.0
+            lines.append(f"  {words}{', but fell back' if fell_back else ''}")
         if word == "contact_lost" and self.scene.contact == "stop" and isinstance(self.scene.body, Top):
             lines.append("  to continue through the flight, use a Scene with contact='hybrid'")
         if "axis_drift" in self.stats:
