@@ -112,7 +112,7 @@ def drawn_by(model: Any, draw: Draw) -> Any:
     if draw is None:
         return model
     if not callable(draw) or not hasattr(model, "draw"):
-        raise ValueError(f"draw = {shown(draw)} must be a function draw(system, t, y) for your own system")
+        raise ValueError(f"draw = {shown(draw)} must be a function draw(system, t, y) for an own system")
     return dataclasses.replace(model, **{"draw": draw})
 
 
