@@ -24,7 +24,7 @@ from ..terminal import status_line
 from ..text import shown
 from ..validation import Bound, explaining, require_outside, require_whole
 from .crossings import crossings
-from .event import modes_of
+from .event import UNMEASURED, modes_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, check_run, model_of, settings_for_lanes
 from .simulate import Samples
 from .sweep import Options, named_axes, require_names, table_of
@@ -217,7 +217,8 @@ def lyapunov_spectrum(
     - `tolerance`, `solver`: as for `lyapunov_exponent`.
 
     **Returns:** a `LyapunovSpectrum`; its numbers are NaN if the run ends early. If resets take directions away, as when a body
-    comes to rest, the last exponents are minus infinity.
+    comes to rest, the last exponents are minus infinity. For scenes and for systems with constraints, exponents below -25 / t1
+    are NaN, because round-off hides them; a shorter run has them.
 
     **Raises:** `ValueError` for arguments outside these ranges, and inside transformations.
 
@@ -243,7 +244,7 @@ def lyapunov_spectrum(
     model = model_of(system, start, None, input, jumps).without_event()
     check_run(model, t1, tolerance)
     settings, t1 = settings_for_lanes(tolerance, solver), float(t1)
-    tangents = independent_directions(model)
+    tangents, is_constrained = independent_directions(model)
     if n is not None:
         require_whole(n, "n", 1)
         if n > len(tangents):
@@ -253,6 +254,9 @@ def lyapunov_spectrum(
     (status,) = np.asarray(_ended(model, jax.tree.map(jnp.asarray, ended), settings.tolerance))
     # Directions that a reset takes away do not come back. The sum is averaged as the exponents are.
     logarithm = np.where(np.logical_or.accumulate(np.isneginf(logarithm)), -np.inf, logarithm)
+    if is_constrained:
+        is_hidden = np.cumsum(logarithm, axis=0).min(axis=0) < -MOST_DECAY
+        logarithm = np.where(is_hidden & ~np.isneginf(logarithm), np.nan, logarithm)
     with np.errstate(invalid="ignore"):
         rates, errors = exponent_of(np.concatenate([logarithm[..., 0], logarithm.sum(axis=1)], axis=1), t1)
     if status != Status.COMPLETED:
@@ -267,12 +271,16 @@ def lyapunov_spectrum(
     return LyapunovSpectrum(rates[order], errors[order], total, error, word, end, steps, times, running[:, order])
 
 
+#: If some changes of the state are impossible, round-off towards them hides changes that have decayed by more than e to this
+#: power.
+MOST_DECAY = 25.0
+
 #: Changes of the start that are smaller than this, without their parts along others, are not independent of these.
 INDEPENDENT = 1e-9
 
 
-def independent_directions(model: AbstractModel) -> Float[Array, "directions components 1"]:
-    """Independent generic changes of the start of one run, as many as there are."""
+def independent_directions(model: AbstractModel) -> tuple[Float[Array, "directions components 1"], bool]:
+    """Independent generic changes of the start of one run, as many as there are; and whether other changes are impossible."""
     first = model.direction(1)
     if model.smooth:
         magnitudes = model.problem(1, model.comparable).start()[1]
@@ -282,7 +290,8 @@ def independent_directions(model: AbstractModel) -> Float[Array, "directions com
     count = len(first)
     changes = jnp.stack([first, *(model.direction(1, number) for number in range(1, count))])
     lengths, _ = orthonormalised(changes / magnitudes)
-    return changes[np.exp(np.asarray(lengths)[:, 0]) > INDEPENDENT]
+    is_new = np.exp(np.asarray(lengths)[:, 0]) > INDEPENDENT
+    return changes[is_new], bool(is_new.sum() < np.sum(np.asarray(magnitudes) < UNMEASURED))
 
 
 def exponent_of_model(model: AbstractModel, t1: float, settings: Settings, shape: tuple[int, ...]) -> LyapunovExponent:
@@ -353,6 +362,8 @@ def _rescaled(
         moved = variations - problem.field(clock, primal) * shifts
         tangents = jnp.where(mode == number, moved, tangents)
         magnitudes = jnp.where(mode == number, problem.start()[1], magnitudes)
+    # Runs are compared at the same time: what a clock differs by is round-off, which would outlast all that decays.
+    tangents = jnp.where(magnitudes < UNMEASURED, tangents, 0.0)
     logarithm, frame = orthonormalised(tangents / magnitudes)
     unit = jnp.concatenate([primal[None], frame * magnitudes])
     return logarithm, jnp.concatenate([unit, jnp.zeros_like(unit[:, :1])], axis=1).reshape(state.shape)

@@ -28,9 +28,13 @@ def test_the_rise_of_an_upright_top_is_the_greatest_eigenvalue():
 def test_the_spectrum_of_an_upright_top_is_that_of_its_matrix():
     """Each eigenvalue of the standing top has its exponent, and the rotation about the vertical has a zero."""
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
-    result = nonholonomic.lyapunov_spectrum(scene, tippe.Launch(0.0, 155.0), 30.0, n=5)
     rates = np.sort(np.linalg.eigvals(np.asarray(steady.standing_matrix(scene, 155.0))).real)[::-1]
-    assert_close(result.exponents, [*rates[:2], 0.0, *rates[2:4]], atol=2e-3)
+    result = nonholonomic.lyapunov_spectrum(scene, tippe.Launch(0.0, 155.0), 30.0)
+    assert_close(result.exponents[:5], [*rates[:2], 0.0, *rates[2:4]], atol=2e-3)
+    # Round-off in the length of the axis, which stays, hides what decays fast, and not yet in a short run.
+    assert np.isnan(result.exponents[5:]).all()
+    result = nonholonomic.lyapunov_spectrum(scene, tippe.Launch(0.0, 155.0), 3.0)
+    assert_close(result.exponents[5:], rates[4:], atol=1e-4)
 
 
 @pytest.mark.slow

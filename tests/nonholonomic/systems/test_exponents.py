@@ -92,6 +92,35 @@ def test_the_spectrum_through_resets_is_that_of_the_map():
     assert np.isnan(result.dimension)
 
 
+class Bouncer(AbstractMode):
+    """A ball on a table that vibrates."""
+
+    restitution: float
+    phase: float
+    amplitude: float = 1.3
+
+    def field(self, t, y):
+        return jnp.array([y[1], -1.0])
+
+    def margin(self, t, y):
+        return y[0] - self.amplitude * jnp.sin(t + self.phase)
+
+    def reset(self, t, y):
+        table = self.amplitude * jnp.cos(t + self.phase)
+        return jnp.array([y[0], -self.restitution * y[1] + (1.0 + self.restitution) * table]), 0
+
+
+def test_both_exponents_of_a_driven_ball_are_half_the_loss_of_area():
+    """On its stable motion with one impact in a period, a complex pair; each impact shrinks areas by e^2."""
+    phase = -np.arccos(np.pi / 3.9)
+    start = [1.3 * np.sin(phase) + 1e-9, np.pi]
+    result = lyapunov_spectrum(Hybrid([Bouncer(0.5, phase)]), start, t1=1259.0, tolerance=1e-8)
+    assert result.exponents.shape == (2,)
+    assert_close(result.exponents, np.log(0.5) / (2.0 * np.pi), atol=3e-3)
+    # Within one impact in the second half of the run.
+    assert_close(result.sum, np.log(0.5) / np.pi, atol=3e-3)
+
+
 def test_constraints_take_directions_away():
     """A bead on a rail has two coordinates that may change, and one rate: the others part neither from it nor to it."""
     start = ([1.0, 0.3], [0.0, 0.0])
