@@ -1,8 +1,10 @@
 """Fits of any model: their data, and the predictions that are compared with the data."""
 
+import contextlib
 import dataclasses
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -583,6 +585,7 @@ def posterior_of_runs(
         check_run(source.model, end, tolerance)
     unknowns = free_numbers(free, sources)
     require_apart("free", unknowns)
+    require_room(sources[0].model, unknowns)
     offsets = np.cumsum([0, *(source.size for source in several)])
     seen = np.concatenate([first + source.seen for first, source in zip(offsets, several, strict=False)])
     first, own = sources[0].model, set(map(own_name, unknowns))
@@ -610,6 +613,28 @@ def posterior_of_runs(
     # Recorded degrees are no reason to show a spin in degrees per second.
     unit = (*unit_of(*(data.launch for data in several), *several), "rad/s")
     return dataclasses.replace(density, series_shown=tuple(series_shown), own_units=own_units, unit=unit)
+
+
+def require_room(model: AbstractModel, unknowns: dict[str, Free]) -> None:
+    """Raise `ValueError` for an unknown that no value near its start value leaves with a legal start of the run, as where the
+    constraints of a system depend on it."""
+    for name, unknown in unknowns.items():
+        reasons = []
+        for value in (0.99 * unknown.start, 1.01 * unknown.start) if own_name(name) in model.known else ():
+            # The values of the user have been asked about already.
+            with contextlib.suppress(ValueError), warnings.catch_warnings(action="ignore"):
+                near = {own_name(name): value}
+                # Values that the modules refuse are bounds of the search.
+                model.require_values(near)
+                try:
+                    model.replaced(near).check()
+                except ValueError as error:
+                    reasons.append(str(error))
+        if len(reasons) == 2:
+            raise ValueError(
+                f"free: {name} = {unknown.start:.6g} is legal for this start and its neighbours are not: {reasons[0]}; start "
+                f"at rest, or where the constraints hold whatever {name} is"
+            )
 
 
 def of_data(parameters: dict[str, Value], k: int) -> dict[str, Value]:

@@ -334,6 +334,8 @@ class Table(eqx.Module):
         """The axes; and a summary of each variable: its name with its dimensions, its range, and its long name."""
         axes = ", ".join(f"{name} ({len(self.coords[name])})" for name in axes_of(self.coords, self.inner))
         title = f"Table over {axes or 'one cell'}"
+        if 0 in self.shape:
+            return title, []
         if isinstance(self.variables, Stored):
             place = f"in {self.variables.path}"
             return title, [(name, place, self.long_names.get(name, "")) for name in self.variables]

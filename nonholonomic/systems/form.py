@@ -303,6 +303,9 @@ def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
     """Raise `ValueError` unless the start is one of this system, and warn of misspelt methods."""
     modes = [system] if isinstance(system, AbstractSystem) else system.modes
     for mode in modes:
+        for field in dataclasses.fields(mode):
+            if isinstance(value := getattr(mode, field.name), str) and field.type in (float, int):
+                raise ValueError(f"{type(mode).__name__}: {field.name} = {value!r} is a text, not a number")
         warn_of_misspelt_methods(mode, AbstractSystem if isinstance(mode, AbstractSystem) else AbstractMode)
     mechanical = {number: mode for number, mode in enumerate(modes) if isinstance(mode, AbstractSystem)}
     sizes = {mode.dimension for mode in mechanical.values()}

@@ -220,6 +220,11 @@ def _draw_lines(
             drawing.plot(values, heights, mark, color=curve.get_color(), transform=drawing.get_xaxis_transform())
     for word, mark in marks.items():
         drawing.plot([], [], mark, color="0.35", label=word.replace("_", " "))
+    if marks:
+        # A strip of its own, so that a mark is not read as a value.
+        drawing.axhspan(
+            0.0, MARK * (1 + lines.shape[1]), color="0.9", transform=drawing.get_xaxis_transform(), zorder=0
+        )
     if drawing.get_legend_handles_labels()[1]:
         drawing.legend()
     if not np.any(has_number):

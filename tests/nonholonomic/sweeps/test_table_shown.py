@@ -100,6 +100,10 @@ def test_colours_lie_between_quantiles_and_may_be_logarithmic(table):
     assert not any("10^" in tick for tick in ticks)
 
 
+def test_an_empty_table_is_one_line():
+    assert str(Table({"reset": np.arange(0)}, {"time": np.zeros(0)}, {}, {})) == "Table over reset (0)"
+
+
 def test_lines_without_a_time_say_why_they_are_empty():
     status = np.array(["not_inverted", "contact_lost", "not_inverted"])
     none = Table({"spin": SPIN[:3]}, {"time": np.full(3, np.inf), "status": status}, {"spin": "rad s-1"}, {})
@@ -120,6 +124,9 @@ def test_cells_without_a_time_are_marked_and_named():
         np.testing.assert_array_equal(np.isfinite(heights), np.isnan(line.get_ydata()))
         assert (np.sum(np.isfinite(heights)), marks.get_color()) == (count, line.get_color())
         assert np.all(heights[:count] < 0.1)
+    # They stand in a strip of their own.
+    (strip,) = lines.patches
+    assert strip.get_height() == pytest.approx(0.09)
     variables = {name: np.tile(values[:, :1], 14) for name, values in variables.items()}
     axes = Table({"x": np.arange(12.0), "y": np.arange(14.0)}, variables, {"time": "s"}, {}).plot().axes[0]
     axes.figure.draw_without_rendering()

@@ -8,7 +8,17 @@ import pytest
 from close import assert_close
 from own_modes import GRAVITY, Ball, Sleigh, Slip, Stick
 
-from nonholonomic import AbstractMode, EventTimes, Free, Hybrid, Recording, identify, simulate
+from nonholonomic import (
+    AbstractMode,
+    AbstractSystem,
+    EventTimes,
+    Free,
+    Hybrid,
+    Recording,
+    identify,
+    log_density,
+    simulate,
+)
 from nonholonomic.identification import FitWarning
 from nonholonomic.parameters import Parameters
 
@@ -97,3 +107,27 @@ def test_the_clock_of_a_recording_is_fitted_through_resets():
     data = Recording([1.0, 0.0, 0.0], times + 0.02, heights, 1e-3, "y0")
     fit = identify(Hybrid([Ball(0.8)]), data, {"t0": 0.0, "restitution": 0.78}, starts=4, progress=False)
     assert abs(fit.estimates["t0"] - 0.02) < fit.standard_errors["t0"] < 1e-3
+
+
+class Incline(AbstractSystem):
+    """A bead on a straight wire, of which the slope is known by its constraint alone."""
+
+    slope: float
+    dimension = 2
+
+    def metric(self, q):
+        return jnp.eye(2)
+
+    def constraints(self, q):
+        return jnp.array([[-self.slope, 1.0]])
+
+
+def test_a_number_that_the_start_fixes_cannot_be_free():
+    """Each other slope makes the start illegal, so nothing could be fitted; from rest it can."""
+    times, places = np.array([0.5, 1.0]), np.array([0.5, 1.0])
+    data = Recording(([0.0, 0.0], [1.0, 0.3]), times, places, 0.01, "q0")
+    with pytest.raises(
+        ValueError, match=r"free: system.slope = 0.3 is legal for this start and its neighbours are not: start"
+    ):
+        identify(Incline(0.3), data, {"slope": 0.3}, progress=False)
+    log_density(Incline(0.3), Recording(([0.0, 0.0], [0.0, 0.0]), times, places, 0.01, "q0"), {"slope": 0.3})

@@ -191,6 +191,11 @@ def test_a_number_of_the_system_may_be_infinite_whatever_its_name():
     assert_close(state, np.exp([[-1.0]]), rtol=1e-8)
 
 
+def test_a_number_given_as_text_is_named():
+    with pytest.raises(ValueError, match=r"restart = '0.8' is a text"):
+        check_start(Hybrid([Capped("0.8")]), np.ones(1))
+
+
 def test_a_misspelt_method_is_reported():
     """Only where the class does not define the method itself, and no other method calls this one."""
     force = broken(Sleigh, forces=lambda self, t, q, rate: -rate)
