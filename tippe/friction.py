@@ -58,8 +58,9 @@ A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.
 #: What to do where an argument of Coulomb's law is missing.
 ADVICE = {"slip_speed": "usual slip speeds are 0.01 to 0.1 m/s, as in slip_speed=0.05"}
 
-#: Slip speeds [m/s] above which mu and the slip speed may have been exchanged, and above which another unit is suspected.
-USUAL_SLIP_SPEED, GREATEST_SLIP_SPEED = 0.2, 5.0
+#: The greatest usual slip speed [m/s] and mu, if they may have been exchanged; the slip speed above which another unit is
+#: suspected.
+USUAL_SLIP_SPEED, USUAL_MU, GREATEST_SLIP_SPEED = 0.2, 1.5, 5.0
 
 #: Ranges of the numbers of the laws, and above which another unit is suspected.
 FRICTION = Bound.NOT_NEGATIVE | {"usual": Usual(5.0, {"%": 0.01})}
@@ -117,7 +118,7 @@ class AbstractFriction(Bounded):
         if not is_own:
             return None if is_traced(self) else drive(as_law(self))
         mu, speed = (largest(getattr(self, name, 0.0)) for name in ("mu", "slip_speed"))
-        if mu and max(USUAL_SLIP_SPEED, mu) < speed <= GREATEST_SLIP_SPEED:
+        if 0.0 < mu < USUAL_SLIP_SPEED < speed <= USUAL_MU:
             return f"slip_speed = {speed:g} m/s > mu = {mu:g}: were they exchanged? {ADVICE['slip_speed']}"
         return super().suspicion()
 

@@ -175,7 +175,11 @@ class AbstractSystem(eqx.Module):
         return jnp.zeros((), q.dtype)
 
     def constraints(self, q: Coordinates) -> Float[Array, "k n"]:
-        """One-forms W(q), one per row, that vanish on every allowed velocity; none by default."""
+        """One-forms W(q), one per row, that vanish on every allowed velocity; none by default.
+
+        Where they depend on a number of the system, the start has to change with it: the derivative by the number alone is
+        that of runs that leave the constraints.
+        """
         return jnp.zeros((0, q.size), q.dtype)
 
     def frame(self, q: Coordinates) -> Float[Array, "n n"]:

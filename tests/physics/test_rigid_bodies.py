@@ -313,7 +313,7 @@ def test_the_inertia_of_a_rattleback_is_found_from_its_motion():
         ),
         (lambda: tippe.Ellipsoid(1.0, SHAPE, CENTRE, np.diag([1.0, 1.0, 0.0])), "positive; here they are 0, 1, 1"),
         (lambda: tippe.Ellipsoid(1.0, SHAPE, CENTRE, [[1, 2, 0], [0, 1, 0], [0, 0, 1]]), r"inertia\[0\]\[1\] = 2"),
-        (lambda: tippe.Ellipsoid(1.0, SHAPE, CENTRE, [1, 2, 3]), r"shape \(3, 3\)"),
+        (lambda: tippe.Ellipsoid(1.0, SHAPE, CENTRE, [1, 2, 3]), r"must be a \(3, 3\) matrix"),
         (lambda: tippe.Ellipsoid(1.0, SHAPE[:2], CENTRE, INERTIA), "semi_axes .* three numbers"),
         (lambda: tippe.Ellipsoid(1.0, SHAPE, (0.0, 0.0, -0.03), INERTIA), "centre of mass lies inside"),
         (lambda: tippe.RigidBody(1.0, INERTIA, lambda d: 0.1 + 0.1 * d[0] ** 4), "strictly convex"),

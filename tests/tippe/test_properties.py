@@ -158,15 +158,18 @@ MIRRORS = {
 
 
 def check_mirrors(arena: str, scene: tippe.Scene, launch: tippe.Launch):
-    """Every arena has two mirrors. The other side of a mirror is the same to the last bit, and takes the same steps."""
+    """Every arena has two mirrors. The other side of a mirror is the same, on most processors to the last bit; on some, a
+    compiler's sums differ in the last bit, and a run may take another step."""
     states, plain_run = scene.state(launch), ends(scene, launch)
     for velocity, axis, momentum, places in MIRRORS.values():
         signs = np.array([*velocity, *axis, *momentum, *places[arena]])[:, None]
         mirrored = ends(scene, launch, states=signs * states)
         np.testing.assert_array_equal(mirrored.status, plain_run.status)
-        np.testing.assert_array_equal(mirrored.steps, plain_run.steps)
-        np.testing.assert_array_equal(mirrored.end_time, plain_run.end_time)
-        np.testing.assert_array_equal(signs * mirrored.state, plain_run.state)
+        np.testing.assert_allclose(mirrored.steps, plain_run.steps, atol=2)
+        np.testing.assert_allclose(mirrored.end_time, plain_run.end_time, rtol=1e-6)
+        difference = np.abs(signs * mirrored.state - plain_run.state)
+        assert np.median(np.max(difference, axis=0)) == 0.0
+        assert np.all(difference <= 1e-5 * np.max(np.abs(plain_run.state), axis=1, keepdims=True))
 
 
 def check_units(scene: tippe.Scene, launch: tippe.Launch, exponents: tuple[int, int, int]):
