@@ -195,7 +195,9 @@ LINES = {line for call, _ in SUSPECTED.values() for *_, line in call.__code__.co
 def nothing_runs(monkeypatch):
     """What would run says that it was asked to."""
     monkeypatch.setattr(importlib.import_module("tippe.runs.verbs"), "time_of_event", lambda *_: jnp.inf)
-    monkeypatch.setattr(importlib.import_module("tippe.runs.verbs"), "simulate_launch", lambda *_: None)
+    monkeypatch.setattr(
+        importlib.import_module("tippe.runs.verbs"), "simulate_launch", lambda *_: object.__new__(tippe.Trajectory)
+    )
     monkeypatch.setattr(
         importlib.import_module("tippe.runs.verbs"), "compute_table", lambda *_, **__: table_of_times([5.0], [9])
     )

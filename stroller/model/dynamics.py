@@ -38,7 +38,7 @@ State = Float[Array, "components ..."]
 WHEELBASE = Bound.POSITIVE | {"usual": Usual(20.0, {"mm": 1e-3, "cm": 1e-2})}
 
 #: The usual radius of gyration about the rear axle, in wheelbases.
-GYRATION = (0.1, 10.0)
+GYRATION = (0.13, 10.0)
 ODD = ", as the inertia is usually mass wheelbase^2 / 4: were they exchanged, or not in kg, m and kg m^2?"
 
 

@@ -30,10 +30,11 @@ from nonholonomic.validation import (
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import HEADING, STEERING, Launch, Scene, as_numbers, as_place
 
-#: Numbers, points (..., points, 2), and points of the ground, seen from above or in space, in NumPy or in JAX.
+#: Numbers, points (..., points, 2), and points or a point of the ground, seen from above or in space, in NumPy or in JAX.
 Numbers: TypeAlias = Float[Array | np.ndarray, "..."]
 Points: TypeAlias = Float[Array | np.ndarray, "... points 2"]
 Corners: TypeAlias = Float[Array | np.ndarray, "... points axes"]
+Point: TypeAlias = Float[Array | np.ndarray, "... axes"]
 
 #: The frame of an obstacle, in the ground's axes: its origin, the directions of its axes, and upwards.
 Frame: TypeAlias = Float[Array | np.ndarray, "... 4 3"]
@@ -178,7 +179,7 @@ class Footprint(Bounded):
         yield from super().bounds()
         yield Bound(self.rear, "rear", at_most=self.length, why="the length")
 
-    def corners(self, place: Corners, heading: Corners, left: Corners) -> Corners:
+    def corners(self, place: Point, heading: Point, left: Point) -> Corners:
         """The corners [m], counterclockwise. **Arguments:** `place`: the rear axle [m]; `heading`, `left`: unit vectors
         of the stroller, seen from above or in space."""
         front, half = self.length - self.rear, self.width / 2.0
