@@ -243,7 +243,9 @@ def require_increasing(values: Any, name: str) -> None:
     **Arguments:** `values`: numbers; traced lists pass; `name`: name in the message.
     """
     if np.ndim(values) != 1 or np.shape(values)[0] == 0:
-        raise ValueError(f"{name} = {shown(values)} must be a list of at least one number, not {np.shape(values)}")
+        raise ValueError(
+            f"{name} = {shown(values)} must be a list of at least one number, not of shape {np.shape(values)}"
+        )
     if is_traced(values):
         return
     numbers = np.asarray(values)

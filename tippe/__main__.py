@@ -60,9 +60,13 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
-    command.add_argument("--paper", action="store_true", help="the papers' Tables 2 and 3 beside computed times")
+    command.add_argument(
+        "--paper", action="store_true", help="the papers' Tables 2 and 3 beside computed times, instead"
+    )
     command.add_argument("--top", choices=list(TOPS), default="wooden", help="one of `tippe.presets`")
-    command.add_argument("--theta", type=float, nargs="+", default=[3.0, 6.0, 12.0, 18.0], help="theta(0) [deg]")
+    command.add_argument(
+        "--theta", type=float, nargs="+", default=[3.0, 6.0, 12.0, 18.0], help="inclinations theta(0) [deg]"
+    )
     command.add_argument("--rpm", type=float, default=1900.0, help="spin at the start [revolutions per minute]")
     command.add_argument("--mu", type=float, nargs="+", default=[0.1, 0.2, 0.3, 0.4, 0.5], help="Coulomb friction [1]")
     command.add_argument("--slip-speed", type=float, default=0.05, help="slip below which friction falls to zero [m/s]")

@@ -412,7 +412,9 @@ class Recording(AbstractRecording):
         is_outside = seen & ((theta < -reach) | (theta > math.pi + reach))
         for row in np.flatnonzero(is_outside)[:1]:
             number, degrees = f"{theta[row]:g}", math.degrees(theta[row])
-            hint = f"pi rad: was it recorded in degrees? Pass np.radians({number}), or the unit 'deg' with a file"
+            hint = (
+                f"pi rad: was it recorded in degrees? Pass np.radians({number}), or the unit 'deg' when you read a file"
+            )
             # Radians of round degrees were in degrees before.
             if abs(degrees - round(degrees, 3)) < 1e-9:
                 number, hint = f"{degrees:g} deg", "180 deg"

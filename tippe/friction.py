@@ -309,7 +309,9 @@ class Rolling(AbstractFriction):
     def __check_init__(self):
         require_kind(self.sliding, "sliding", AbstractFriction, A_LAW)
         if isinstance(self.sliding, Rolling | NoSlip) or self.sliding.set_valued:
-            raise ValueError(f"sliding = {shown(self.sliding)} must be a sliding law with a force at every slip")
+            raise ValueError(
+                f"sliding = {shown(self.sliding)} must be a sliding law with a force at every slip velocity"
+            )
 
     @property
     def units(self) -> dict[str, str]:

@@ -102,7 +102,12 @@ def parser() -> argparse.ArgumentParser:
     scene.add_argument("--cylinder-radius", type=float, default=0.3, help="radius of the cylinder [m]")
     scene.add_argument("--mu", type=float, default=0.3, help="friction, viscous [s/m], or Coulomb with --slip-speed")
     scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
-    scene.add_argument("--surface", nargs="+", metavar=("NAME", "NUMBER"), help="another arena: " + ", ".join(SURFACES))
+    scene.add_argument(
+        "--surface",
+        nargs="+",
+        metavar=("NAME", "NUMBER"),
+        help="another arena, by its name and numbers [m, rad]: " + ", ".join(SURFACES),
+    )
     scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
     launch = command.add_argument_group("the launches")
     launch.add_argument("--theta", type=float, nargs="+", default=list(THETAS), help="inclinations theta(0) [rad]")
@@ -113,7 +118,12 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--t1", type=float, default=60.0, help="horizon [s]")
     run.add_argument("--angle", type=float, default=0.95 * math.pi, help="angle that counts as inverted [rad]")
     run.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of the integration")
-    run.add_argument("--out", type=Path, default=Path("tippe-paper-out"), help="folder for tables and picture")
+    run.add_argument(
+        "--out",
+        type=Path,
+        default=Path("tippe-paper-out"),
+        help="folder for the tables and the picture; use another one for another run",
+    )
     return command
 
 

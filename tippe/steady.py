@@ -76,7 +76,7 @@ def _require_scene_of_a_top(scene: Scene, any_arena: bool = False) -> None:
     _require_top(scene.body)
     if not (scene.level or any_arena):
         raise ValueError(
-            f"surface = {shown(scene.surface)} must be a Plane without tilt: no other top tumbles steadily"
+            f"surface = {shown(scene.surface)} must be a Plane without tilt: on other arenas, no top tumbles steadily"
         )
 
 
@@ -85,7 +85,9 @@ def _require_standing(scene: Scene, spin: object, inverted: object) -> None:
     require_kind(scene, "scene", Scene)
     if isinstance(scene.body, AbstractRigidBody):
         kind = type(scene.body).__name__
-        raise ValueError(f"body = {kind} must be a body of revolution, a Top or a SpheroidBody, to stand and spin")
+        raise ValueError(
+            f"body = {kind} must be a body of revolution, such as a Top or a SpheroidBody, to stand and spin"
+        )
     require(spin, "spin")
     require_flag(inverted, "inverted")
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import partial_eval
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.tracing import dependent_outputs
 from ..compilation.xla_cpu import traced_once
@@ -438,6 +438,17 @@ def orthonormalised(
     return jnp.log(lengths), jnp.moveaxis(frame.mT, 0, -1)
 
 
+def continued(before: PyTree, after: PyTree) -> tuple[Bool[np.ndarray, " cells"], PyTree]:
+    """The runs that had not ended before, and how all runs have ended.
+
+    **Arguments:** `before`, `after`: the outcomes of the runs, and of their continuations for another interval of time.
+    """
+    alive = np.isin(before.status, (RUNNING, REACHED_END))
+    sums = {"end_time", "steps", "rejected", "counts"} & set(after._fields)
+    added = {name: getattr(before, name) + getattr(after, name) for name in sums}
+    return alive, jax.tree.map(lambda new, old: np.where(alive, new, old), after._replace(**added), before)
+
+
 def in_stretches(
     advance: Callable[[PyTree, float, float], tuple[Float[Array, "tangents cells"], PyTree, Any]],
     state: PyTree,
@@ -459,16 +470,10 @@ def in_stretches(
             for interval in range(intervals):
                 begin = number * t1 / stretches + interval * duration
                 logarithm, runs, outcome = advance(runs, begin, duration)
-                alive, steps = np.True_, outcome.steps
-                if ended is not None:
-                    # Runs that had ended stay as they were.
-                    alive = np.isin(ended.status, (RUNNING, REACHED_END))
-                    sums = {"end_time", "steps", "rejected", "counts"} & set(outcome._fields)
-                    added = {name: getattr(ended, name) + getattr(outcome, name) for name in sums}
-                    outcome = jax.tree.map(lambda new, old: np.where(alive, new, old), outcome._replace(**added), ended)  # noqa: B023
-                ended, logarithm = outcome, np.where(alive, logarithm, 0.0)
+                alive, ended = (np.True_, outcome) if ended is None else continued(ended, outcome)
+                logarithm = np.where(alive, logarithm, 0.0)
                 total = total + logarithm
-                is_coarse = alive & (steps > FEW_STEPS) & (np.abs(logarithm) > MOST_GROWTH)
+                is_coarse = alive & (outcome.steps > FEW_STEPS) & (np.abs(logarithm) > MOST_GROWTH)
                 if is_coarse.any() and intervals < MOST_INTERVALS:
                     intervals *= 2
                     break

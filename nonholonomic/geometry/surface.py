@@ -593,7 +593,9 @@ class Torus(AbstractGradientSurface):
 
     def bounds(self) -> Iterator[Bound]:
         yield from super().bounds()
-        yield Bound(self.tube, "tube", below=self.ring, why="the radius of the ring: else the tube would cut itself")
+        yield Bound(
+            self.tube, "tube", below=self.ring, why="the radius of the ring: otherwise the tube would cut itself"
+        )
 
     def from_middle(self, position: Vector) -> Vector:
         """The vector [m] to a position from the nearest point of the circle along the middle of the tube."""

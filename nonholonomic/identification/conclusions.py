@@ -506,7 +506,9 @@ def remarks(
         if max(sides) > SKEWED * max(min(sides), 1e-300):
             skewed.append(name)
     if skewed:
-        notes.append(f"the likelihood profile of {', '.join(skewed)} is no parabola: use the interval, not the error")
+        notes.append(
+            f"the likelihood profile of {', '.join(skewed)} is no parabola: use the interval, not the standard error"
+        )
     ratios = np.sqrt(np.diag(distribution.covariance) / np.diag(by_slopes))
     reason = "the predictions are a staircase" if roughness(explorer, sample) > ROUGH else "the predictions bend"
     for verb, factors in (("understate", ratios), ("overstate", 1.0 / ratios)):

@@ -86,7 +86,9 @@ class Measurements(eqx.Module):
         arguments = {"error": error, "censored": censored, "period": period, "student": student}
         for name, argument in (arguments | {"upper": 0.0 if upper is None else upper}).items():
             if np.shape(argument) not in ((), shape):
-                raise ValueError(f"{name} must be one number or of the shape {shape} of value: {np.shape(argument)}")
+                raise ValueError(
+                    f"{name} must be one number or of the shape {shape} of value, not {np.shape(argument)}"
+                )
         value = np.asarray(value, float)
         upper = np.where(censored, np.inf, value) if upper is None else np.broadcast_to(upper, shape)
         require(value[~(np.isneginf(value) & np.isfinite(upper))], "value")

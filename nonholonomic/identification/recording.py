@@ -185,7 +185,9 @@ class AbstractRecording(AbstractData):
         require(self.t0, "t0", below=times[-1], why="the last time")
         shape = (len(times), len(self.columns)) if len(self.columns) > 1 else (len(times),)
         if np.shape(self.value) != shape:
-            raise ValueError(f"value must be of shape {shape} for {', '.join(self.columns)}: {np.shape(self.value)}")
+            raise ValueError(
+                f"value must be of shape {shape} for {', '.join(self.columns)}, not {np.shape(self.value)}"
+            )
         seen = ~np.isnan(np.asarray(self.value))
         if not np.any(seen):
             raise ValueError("value must have at least one number; missing samples are NaN")
@@ -210,7 +212,9 @@ class AbstractRecording(AbstractData):
         for name in (name for name in self.quantities.usual if name in self.columns):
             largest = np.nanmax(samples[:, self.columns.index(name)], initial=0.0)
             if largest > self.quantities.usual[name]:
-                warn(f"{name} = {largest:g} rad is large; recordings are in radians: did you mean np.radians({name})?")
+                warn(
+                    f"{name} = {largest:g} rad is large; recorded angles are in radians: did you mean np.radians({name})?"
+                )
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -329,7 +333,7 @@ class TextTable(NamedTuple):
         if decimal not in (".", ","):
             raise ValueError(f"decimal = {shown(decimal)} must be '.' or ','")
         if columns is not None and (not isinstance(columns, Mapping) or not columns):
-            raise ValueError(f"columns = {shown(columns)} must be a dictionary, as {{'theta': ('tilt', 'deg')}}")
+            raise ValueError(f"columns = {shown(columns)} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}")
         path = as_path(path, "path")
         lines = enumerate(_text(path).splitlines(), start=1)
         text = [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
@@ -448,7 +452,7 @@ class TextTable(NamedTuple):
         unit = of_header if unit is None else unit
         if unit is None:
             known = "deg" if si == "rad" else next(iter(UNITS[si]))
-            expected = f"(header, unit), such as ('tilt', {known!r}), or a header with its unit, as 'tilt [{known}]'"
+            expected = f"(header, unit), such as ('tilt', {known!r}), or a header with its unit, like 'tilt [{known}]'"
             if argument == "error":
                 expected = f"(standard error, unit), such as (1.0, {known!r}), or (header of a column of standard errors, unit)"
             if first is not None:
@@ -576,7 +580,7 @@ def read_columns(
     if any(lost := is_sample & np.isnan(times)):
         left_out = counted(int(np.sum(lost)), "line")
         warn(
-            f"path = {str(file.path)!r}: {left_out} without a time left out, first in line {file.lines[np.argmax(lost)]}"
+            f"path = {str(file.path)!r}: {left_out} without a time left out, the first in line {file.lines[np.argmax(lost)]}"
         )
     for k in (k for k, name in enumerate(names) if known[name] == "rad"):
         _, size = file.parts(names[k])

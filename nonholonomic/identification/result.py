@@ -288,7 +288,9 @@ class Identification:
         verdict, count = self.verdict, self.verdict.starts
         scatter = f"residuals this large have a probability of {verdict.p_value:.2g}"
         if math.isnan(verdict.p_value):
-            scatter = "residuals cannot test the fit: its errors were estimated, or no degree of freedom is left"
+            scatter = (
+                "residuals cannot test the fit: the errors were estimated from it, or no degree of freedom is left"
+            )
         lines = [
             f"-2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
             scatter,
@@ -333,6 +335,9 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
     # The slopes of the parameters with respect to their coordinates.
     slopes = np.asarray(eqx.filter_jit(jax.jvp)(problem.unknowns.values, (optimum,), (np.ones_like(optimum),))[1])
     by_slopes = ends.covariance(best)
+    # An undetermined number has an infinite variance, and its slope may vanish at a bound.
+    with np.errstate(invalid="ignore"):
+        slope_covariance = np.where(by_slopes == 0.0, 0.0, by_slopes * np.outer(slopes, slopes))
     distribution = Distribution.of(optimum, by_slopes, sample)
     likely, covariance = problem.unknowns.values(optimum), distribution.covariance_of_values(problem, slopes)
     numbers = (measurements.value, measurements.error, linearised.prediction[best], linearised.residual[best, :count])
@@ -349,7 +354,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         standard_errors=by_name(np.sqrt(np.diag(covariance)).tolist()),
         covariance=covariance,
         most_likely=by_name(likely.tolist()),
-        slope_errors=by_name((np.abs(slopes) * np.sqrt(np.diag(by_slopes))).tolist()),
+        slope_errors=by_name(np.sqrt(np.diag(slope_covariance)).tolist()),
         deviance=float(deviances[best]),
         degrees=linearised.residual.shape[1] - len(likely),
         identifiability=combinations,
@@ -607,7 +612,9 @@ def sample(
         # A component around a fit.
         numbers, covariance = len(density.problem.names), np.asarray(covariance, float)
         if covariance.shape != (numbers, numbers) or not np.all(np.isfinite(covariance)):
-            raise ValueError(f"covariance must be finite and of shape {(numbers, numbers)}: data do not fix all")
+            raise ValueError(
+                f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"
+            )
         if np.shape(centre) != (numbers,):
             raise ValueError(f"centre = {shown(centre)} must be of shape {(numbers,)}")
         known = Mixture(np.ones(1), np.asarray(centre, float)[None], np.linalg.cholesky(covariance)[None])

@@ -433,7 +433,9 @@ def search(explorer: Explorer, starts: int, max_steps: int, progress: bool) -> t
     acts = explorer.acting(pool)
     if not np.all(acts):
         names = ", ".join(name for name, has_effect in zip(problem.names, acts, strict=True) if not has_effect)
-        warn(f"no prediction depends on {names}, so the data say nothing about it: fix it, or add data", FitWarning)
+        warn(
+            f"no prediction depends on {names}, so the data say nothing about it: fix it, or add other data", FitWarning
+        )
     density = eqx.tree_at(lambda density: density.problem.acts, explorer.density, acts)
     explorer = explorer._replace(density=density)
     recorded = bool(np.any(np.asarray(measurements.time) > 0.0))

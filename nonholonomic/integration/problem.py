@@ -21,7 +21,17 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from ..compilation.xla_cpu import traced_once
 from ..parameters import numbers
 from ..text import shown
-from ..validation import Bound, as_number, is_traced, legal, require_increasing, require_kind, require_scalars, warn
+from ..validation import (
+    Bound,
+    as_number,
+    is_traced,
+    legal,
+    require_all,
+    require_increasing,
+    require_kind,
+    require_scalars,
+    warn,
+)
 from .runge_kutta import AbstractTunedPair, Components, Lanes, Mask, Oscillatory8, States, lesser
 
 # Times at which a field jumps or has a kink: a step ends just before such a time, and the next begins just after it.
@@ -601,8 +611,7 @@ def require_run(
     """
     require_kind(scene, "scene", kinds[0])
     require_kind(launch, "launch", kinds[1], several=lists)
-    for bound in run_bounds(t1, tolerance):
-        bound.require()
+    require_all(run_bounds(t1, tolerance))
     values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
     require_scalars(values, lists)
 
@@ -618,7 +627,9 @@ def require_times(times: ArrayLike | Sequence[float] | None, t1: object) -> None
     ValueError: times ...
     """
     if times is not None and not isinstance(times, str) and np.ndim(times) == 0:
-        raise ValueError(f"times = {shown(times)} must be a list of numbers; np.linspace makes evenly spaced ones")
+        raise ValueError(
+            f"times = {shown(times)} must be a list of at least one number; np.linspace makes evenly spaced ones"
+        )
     Bound(times, "times", at_least=0.0, at_most=t1, why="the run is from 0 to t1").require()
     require_increasing(times, "times")
 
@@ -652,7 +663,9 @@ def require_adjoint(adjoint: object) -> None:
     >>> require_adjoint(diffrax.DirectAdjoint())
     """
     if not isinstance(adjoint, diffrax.AbstractAdjoint | None):
-        raise ValueError(f"adjoint = {shown(adjoint)} must be one of Diffrax, as RecursiveCheckpointAdjoint(), or None")
+        raise ValueError(
+            f"adjoint = {shown(adjoint)} must be one of Diffrax, such as RecursiveCheckpointAdjoint(), or None"
+        )
 
 
 # Passive components: quantities that are integrated with a problem's state but do not act on it, such as a path, work

@@ -74,7 +74,9 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
     """
     tableau = getattr(solver, "tableau", None)
     if not isinstance(solver, diffrax.AbstractERK) or not isinstance(tableau, diffrax.ButcherTableau):
-        raise ValueError(f"solver = {shown(solver)} must be an explicit Runge-Kutta solver of Diffrax, as Dopri8()")
+        raise ValueError(
+            f"solver = {shown(solver)} must be an explicit Runge-Kutta solver of Diffrax, such as Dopri8()"
+        )
     return tableau
 
 

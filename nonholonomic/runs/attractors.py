@@ -105,8 +105,8 @@ def lyapunov_exponent(
     """The largest Lyapunov exponent of a run, by the variational equation, through resets by the saltation matrix.
 
     The exponent is positive if nearby runs diverge exponentially. In chaotic motion, the exponent stays positive as `t1`
-    grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/derivatives/variation.py`. In a run with
-    resets, the tangent is rescaled at the ends of 32 intervals of time.
+    grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/derivatives/variation.py`. The tangent is
+    rescaled at the ends of at least 32 intervals of time.
 
     **Arguments:**
 
@@ -207,7 +207,7 @@ def lyapunov_spectrum(
     """The largest Lyapunov exponents of a run, through resets by the saltation matrix.
 
     Tangents are integrated with the run and orthonormalised again and again. Source: Benettin et al., Meccanica 15 (1980) 9 and
-    21. Volumes that keep their size give a sum of zero, and motion without rest an exponent of zero.
+    21. If volumes keep their size, the sum is zero; a motion that does not come to rest has an exponent of zero.
 
     **Arguments:**
 
@@ -250,8 +250,7 @@ def lyapunov_spectrum(
         if n > len(tangents):
             raise ValueError(f"n = {n} must be at most {len(tangents)}, the number of independent changes of the start")
         tangents = tangents[:n]
-    logarithm, ended = growth_of_model(model, tangents, t1, settings)
-    (status,) = np.asarray(_ended(model, jax.tree.map(jnp.asarray, ended), settings.tolerance))
+    logarithm, ended, (status,) = growth_of_model(model, tangents, t1, settings)
     # Directions that a reset takes away do not come back. The sum is averaged as the exponents are.
     logarithm = np.where(np.logical_or.accumulate(np.isneginf(logarithm)), -np.inf, logarithm)
     if is_constrained:
@@ -261,14 +260,22 @@ def lyapunov_spectrum(
         rates, errors = exponent_of(np.concatenate([logarithm[..., 0], logarithm.sum(axis=1)], axis=1), t1)
     if status != Status.COMPLETED:
         rates, errors = np.full((2, len(rates)), np.nan)
-    times, end = t1 * np.arange(1, STRETCHES + 1) / STRETCHES, float(ended.end_time[0])
-    elapsed = np.where(end > 0.0, np.minimum(times, end), 1.0)
-    running = np.cumsum(logarithm[..., 0], axis=0) / elapsed[:, None]
+    times, running = means_until(logarithm[..., 0], ended.end_time, t1)
     # Directions that do not act on each other keep their order.
     order = np.argsort(-rates[:-1])
-    total, error = float(rates[-1]), float(errors[-1])
+    total, error, end = float(rates[-1]), float(errors[-1]), float(ended.end_time[0])
     word, steps = Status(status).word, int(ended.steps[0])
     return LyapunovSpectrum(rates[order], errors[order], total, error, word, end, steps, times, running[:, order])
+
+
+def means_until(
+    logarithm: Float[np.ndarray, "stretches columns"], end_time: Float[np.ndarray, " columns"], t1: float
+) -> tuple[Float[np.ndarray, " stretches"], Float[np.ndarray, "stretches columns"]]:
+    """The ends of the stretches [s], and the mean growth [1/s] from the start to each of them."""
+    times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
+    elapsed = np.minimum(times[:, None], end_time)
+    # A run of zero length has no growth.
+    return times, np.cumsum(logarithm, axis=0) / np.where(elapsed > 0.0, elapsed, 1.0)
 
 
 #: If some changes of the state are impossible, round-off towards them hides changes that have decayed by more than e to this
@@ -297,15 +304,10 @@ def independent_directions(model: AbstractModel) -> tuple[Float[Array, "directio
 def exponent_of_model(model: AbstractModel, t1: float, settings: Settings, shape: tuple[int, ...]) -> LyapunovExponent:
     """The exponents of a model without an event. **Arguments:** `shape`: shape of the numbers of the model, () or (n,)."""
     cells = int(np.prod(shape, dtype=int))
-    logarithm, ended = growth_of_model(model, model.direction(cells)[None], t1, settings)
-    logarithm = logarithm[:, 0]
-    status = np.asarray(_ended(model, jax.tree.map(jnp.asarray, ended), settings.tolerance))
-    exponent, error = exponent_of(logarithm, t1)
+    logarithm, ended, status = growth_of_model(model, model.direction(cells)[None], t1, settings)
+    exponent, error = exponent_of(logarithm[:, 0], t1)
     is_complete = status == Status.COMPLETED
-    times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
-    elapsed = np.minimum(times[:, None], ended.end_time)
-    # A run of zero length has no divergence.
-    running = np.cumsum(logarithm, axis=0) / np.where(elapsed > 0.0, elapsed, 1.0)
+    times, running = means_until(logarithm[:, 0], ended.end_time, t1)
     return LyapunovExponent(
         exponent=np.where(is_complete, exponent, np.nan).reshape(shape),
         error=np.where(is_complete, error, np.nan).reshape(shape),
@@ -317,16 +319,26 @@ def exponent_of_model(model: AbstractModel, t1: float, settings: Settings, shape
     )
 
 
+def growth_of_model(
+    model: AbstractModel, tangents: Float[Array, "tangents components cells"], t1: float, settings: Settings
+) -> tuple[Float[np.ndarray, "stretches tangents cells"], Outcome | HybridOutcome, Int[np.ndarray, " cells"]]:
+    """The logarithms of the growth of tangents in the cells of a model, how the runs have ended, and their `Status`."""
+    cells = tangents.shape[-1]
+    if model.smooth:
+        logarithm, ended = growth(model.problem(cells, model.comparable), tangents, t1, STRETCHES, settings)
+    else:
+        logarithm, ended = _through_modes(model, tangents, t1, settings)
+    return logarithm, ended, np.asarray(_ended(model, jax.tree.map(jnp.asarray, ended), settings.tolerance))
+
+
 _ended = eqx.filter_jit(lambda model, outcome, tolerance: model.ended(outcome, tolerance))
 
 
-def growth_of_model(
+def _through_modes(
     model: AbstractModel, tangents: Float[Array, "tangents components cells"], t1: float, settings: Settings
-) -> tuple[Float[np.ndarray, "stretches tangents cells"], Outcome | HybridOutcome]:
-    """The logarithms of the growth of tangents in the cells of a model, and how the runs have ended."""
+) -> tuple[Float[np.ndarray, "stretches tangents cells"], HybridOutcome]:
+    """The growth and the outcome of a model with several modes or resets."""
     cells = tangents.shape[-1]
-    if model.smooth:
-        return growth(model.problem(cells, model.comparable), tangents, t1, STRETCHES, settings)
     modes, first, states = modes_of(model, cells, settings.tolerance, model.comparable)
     pairs = tuple((tuple(jax.tree.map(lambda _: None, mode) for mode in modes), change) for change in tangents)
     variational = variational_modes(modes, pairs, settings.tolerance, False)
@@ -538,12 +550,11 @@ def basins(
             "quantities = None: name quantities of the scene that tell attractors apart, such as ['theta']"
         )
     names = tuple(model.quantities) if quantities is None else quantities
-    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
-        raise ValueError(f"quantities = {shown(quantities)} must be a list of names")
     require_names(model.quantities, names)
-    vectors = [name for name in names if model.quantities[name][2] is not None]
-    if vectors:
-        raise ValueError(f"quantities: {vectors[0]!r} is a vector; name scalar quantities")
+    vectors = [name for name in names if model.quantities[name].components is not None]
+    if vectors or not names:
+        wrong = f": {vectors[0]!r} is a vector" if vectors else " = []"
+        raise ValueError(f"quantities{wrong}; name scalar quantities")
     # Times in the golden ratio do not keep step with a drive.
     shares = np.sort(np.arange(SAMPLED) * 0.6180339887498949 % 1.0)
     times = 0.25 * float(t1) * (np.arange(4)[:, None] + shares).ravel()

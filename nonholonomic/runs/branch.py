@@ -36,7 +36,7 @@ class SpecialPoint(NamedTuple):
     `kind` is "fold", "period doubling", "Neimark-Sacker" (a complex pair of multipliers passes through the unit circle),
     "branch point" (another branch of orbits crosses), or "grazing" (a margin touches zero).
 
-    **Example:** of a branch that you have computed, the multipliers at the period doublings are
+    **Example:** the multipliers at the period doublings of a branch are
     `[point.orbit.multipliers for point in branch.special if point.kind == "period doubling"]`.
 
     >>> import nonholonomic
@@ -164,8 +164,6 @@ class Branch(eqx.Module):
             "value": self.values,
             "period": self.periods,
             **dict(zip(self.orbits.names, self.states.T, strict=True)),
-        }
-        columns |= {
             "multipliers_real": np.real(multipliers),
             "multipliers_imag": np.imag(multipliers),
             "stable": self.stable,

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..compilation.xla_cpu import compiled_for_one
+from ..integration.problem import TIGHTEST
 
 if TYPE_CHECKING:
     from .orbit import Orbit
@@ -45,7 +46,7 @@ STEPS, SMALLEST = 50, 1e-9
 #: converged, in units of the tolerance.
 MOST_NEWTON, USUAL, CONVERGED = 8, 4, 0.3
 
-#: The integration is finer than the tolerance of the orbit by this factor.
+#: The last step of Newton's method for an orbit is finer than the tolerance by this factor, and all of a branch.
 FINER = 100.0
 
 #: The smallest cosine of the angle between the tangents at neighbouring points.
@@ -64,7 +65,7 @@ OF_A_FAMILY = (
 #: Singular values below this, as a part of the largest, are round-off.
 ROUND_OFF = 1e-10
 
-#: A predicted state this near the section, in units of the time of a return, is moved onto it.
+#: A state this near the section, in units of the time of a return, is moved onto it.
 NEAR = 0.05
 
 #: The distances from a branch at which another branch is looked for, in units of the scale of the state.
@@ -213,7 +214,7 @@ class Continuation(NamedTuple):
         if self.period is not None:
             horizon, slope = jax.jvp(self.period, (jnp.asarray(value),), (jnp.ones(()),))
             leaves[0], rate = np.asarray(horizon), float(slope)
-        state, tolerance = np.array(self.orbit.state), max(float(leaves[-1]) / FINER, 1e-14)
+        state, tolerance = np.array(self.orbit.state), max(float(leaves[-1]) / FINER, TIGHTEST)
         state[list(search.free)] = unknowns[:-1] * self.scale
         time = float(self.orbit.period) / self.orbit.returns
         numbers = map(np.asarray, (state, rate, time, self.in_motion, tolerance, self.returns))

@@ -346,8 +346,6 @@ def crossings(
     require_event(model)
     check_horizon(t1, tolerance)
     names = (() if is_scene else tuple(model.quantities)) if quantities is None else quantities
-    if isinstance(names, str) or not isinstance(names, Sequence):
-        raise ValueError(f"quantities = {shown(quantities)} must be a list of names")
     require_names(model.quantities, names)
     options = Options(tolerance, solver, max_steps, scattered, False, (), path, progress, executor)
     kind, crossing = (CrossingsAfter, "after") if side == "after" else (Crossings, "first")

@@ -300,4 +300,6 @@ def settings_for_lanes(
 def require_event(model: AbstractModel, purpose: str = "") -> None:
     """Raise `ValueError` unless the model has an event."""
     if not model.has_event:
-        raise ValueError(f"{purpose}event = None: the system has no event of its own; pass event=, a function")
+        raise ValueError(
+            f"{purpose}event = None: the system has no event of its own; pass event=, a function of time and state"
+        )

@@ -27,18 +27,13 @@ from ..terminal import status_line
 from ..text import described, shown
 from ..validation import as_number, explaining, is_traced, require_outside
 from .branch import Branch, branch_of
+from .continuation import FINER, NEAR, RANK
 from .crossings import SAME, on_margin, section_of
 from .event import Ensemble, EventTime
 from .model import AbstractModel, AbstractSceneModel, check_run, model_of, require_event, settings_for_lanes
 
-#: The most Newton steps; the residual at which they have converged, in units of the tolerance; the tolerance of the last step.
-MOST_NEWTON, CONVERGED, FINER = 30, 30.0, 100.0
-
-#: Directions in which 1 - J is smaller than this, or than a hundredth of it of a large 1 - J, belong to a family of orbits.
-RANK = 1e-7
-
-#: A guess this near the section, in units of the period, lies on it.
-NEAR = 0.05
+#: The most Newton steps; the residual at which they have converged, in units of the tolerance.
+MOST_NEWTON, CONVERGED = 30, 30.0
 
 #: Relative steps of a number for the differences that give the derivatives of multipliers, and their weights.
 STENCIL, STENCIL_STEP = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0)), 1e-3

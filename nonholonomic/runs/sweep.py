@@ -229,7 +229,9 @@ def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Numb
 
 
 def require_names(known: dict[str, Quantity], quantities: Sequence[str]) -> None:
-    """Raise `ValueError` unless these are names of quantities, each named once."""
+    """Raise `ValueError` unless this is a list of names of quantities, each named once."""
+    if isinstance(quantities, str) or not isinstance(quantities, Sequence):
+        raise ValueError(f"quantities = {shown(quantities)} must be a list of names")
     for name in quantities:
         if name not in known:
             raise ValueError(f"quantities: {shown(name)} must be one of {', '.join(known)}{likely(name, known)}")
@@ -270,7 +272,9 @@ def full_sensitivities(model: AbstractModel, names: Any, crossing: str) -> list[
         require_event(model, "sensitivities are those of the event's time: ")
         model.require_differentiable(False, crossing == "last")
         if crossing == "both":
-            raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, those of one time")
+            raise ValueError(
+                "crossing = 'both' must be 'first' or 'last' for sensitivities, which differentiate one time"
+            )
     return full_names
 
 

@@ -112,7 +112,9 @@ def drawn_by(model: Any, draw: Draw) -> Any:
     if draw is None:
         return model
     if not callable(draw) or not hasattr(model, "draw"):
-        raise ValueError(f"draw = {shown(draw)} must be a function draw(system, t, y) for an own system")
+        raise ValueError(
+            f"draw = {shown(draw)} must be a function draw(system, t, y) for your own system, and None for a scene"
+        )
     return dataclasses.replace(model, **{"draw": draw})
 
 
@@ -552,7 +554,9 @@ class Trajectory(AbstractRun):
         **Raises:** `ValueError` inside transformations and for a batch of runs: `mode` and `switches` are there.
         """
         if not self._is_one_run:
-            raise ValueError("resets takes one run outside jit, vmap and grad; run.mode and run.switches work there")
+            raise ValueError(
+                "resets takes one run outside jit, vmap and grad; run.mode and run.switches work there too"
+            )
         resets = []
         if not self.model.smooth and int(self.switches):
             modes, first, states = self.model.without_event().modes(1, self.settings.tolerance, None, False)

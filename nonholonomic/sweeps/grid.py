@@ -246,7 +246,9 @@ def scattered_cells(axes: list[Axis]) -> dict[str, Values]:
     lengths = {axis.name: len(axis.values) for axis in axes}
     if len(set(lengths.values())) != 1:
         lengths_text = ", ".join(f"{name} of {length}" for name, length in lengths.items()) or "none"
-        raise ValueError(f"scattered = True takes lists of one length, not {lengths_text}; other numbers are scalars")
+        raise ValueError(
+            f"scattered = True takes lists of one length, not {lengths_text}; the other numbers are scalars"
+        )
     return {axis.number: axis.values for axis in axes}
 
 

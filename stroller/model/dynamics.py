@@ -93,7 +93,9 @@ class Stroller(Bounded):
         if self.centre is not None:
             yield Bound(self.centre, "centre", at_most=self.wheelbase, why="the wheelbase")
             min_inertia = self.mass * self.centre**2
-            yield Bound(self.inertia, "inertia", at_least=min_inertia, why="mass centre^2, as about the rear axle")
+            yield Bound(
+                self.inertia, "inertia", at_least=min_inertia, why="mass centre^2, as it is about the rear axle"
+            )
 
 
 # The equations of motion.

@@ -36,8 +36,11 @@ def as_numbers(value: Any) -> Any:
 #: Largest usual angles [rad] of a recording: a front wheel that turns by half a turn, and a heading after two turns.
 USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
 
-#: Angles, which may have been given in degrees, and are beyond a turn.
+#: Angles that are greater may be in degrees, and are wrong beyond a turn.
 STEERING, HEADING = {"usual": Usual(math.pi, turns=1)}, {"usual": Usual(2.0 * math.pi, turns=1)}
+
+#: Speeds above 60 m/s suggest kilometres per hour. Gravity may be zero.
+SPEED, GRAVITY = {"usual": Usual(60.0, {"km/h": 1.0 / 3.6})}, Bound.GRAVITY | Bound.NOT_NEGATIVE
 
 
 def as_place(value: Any, name: str = "place", counts: tuple = (2, 3), single: bool = False) -> tuple[Converted, ...]:
@@ -48,12 +51,6 @@ def as_place(value: Any, name: str = "place", counts: tuple = (2, 3), single: bo
     if not isinstance(numbers, tuple) or len(numbers) not in counts or (single and any(map(np.ndim, numbers))):
         raise ValueError(f"{name} = {shown(numbers)} must be a pair of numbers{', or (x, y, z) [m]' * (3 in counts)}")
     return numbers
-
-
-GRAVITY = Bound.GRAVITY | Bound.NOT_NEGATIVE
-
-#: Speeds above 60 m/s suggest kilometres per hour.
-SPEED = {"usual": Usual(60.0, {"km/h": 1.0 / 3.6})}
 
 
 class Launch(Bounded):

@@ -292,7 +292,7 @@ def test_a_table_starts_on_the_wall():
             lambda top: tippe.inversion_table(
                 tippe.Scene(top, contact="hybrid"), theta=0.1, spin=100.0, t1=1.0, method="diffrax"
             ),
-            "method = 'diffrax' has no runs of several modes",
+            "method = 'diffrax' does not support runs of several modes",
         ),
         (
             lambda top: jax.jit(

@@ -229,7 +229,7 @@ def test_the_error_of_many_slips_falls_with_the_tolerance_and_is_known():
     [
         (
             lambda s: tippe.inversion_table(s, theta=0.1, spin=100.0, t1=1.0, method="diffrax"),
-            "method = 'diffrax' has no runs of several modes",
+            "method = 'diffrax' does not support runs of several modes",
         ),
         (lambda s: tippe.SetValuedCoulomb(-0.1), "mu = -0.1 must be at least 0"),
     ],

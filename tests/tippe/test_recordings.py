@@ -259,7 +259,9 @@ def test_a_class_has_files_of_its_own(tmp_path, name, encoding):
 def test_angles_in_degrees_are_suspected():
     """An inclination of more than pi is refused, a large direction is suspected only: it may count turns."""
     launch, times = tippe.Launch(0.1, 100.0), [0.0, 0.1]
-    with pytest.warns(UserWarning, match=r"azimuth = 170 rad is large; recordings are in radians: did you mean np"):
+    with pytest.warns(
+        UserWarning, match=r"azimuth = 170 rad is large; recorded angles are in radians: did you mean np"
+    ):
         tippe.Recording(launch, times, [[0.1, 20.0], [0.1, -170.0]], 0.01, ("theta", "azimuth"))
     ride = stroller.Launch((0.0, 0.0), 0.0, 1.0)
     with pytest.warns(UserWarning, match="steering = 25 rad is large"):
@@ -269,7 +271,7 @@ def test_angles_in_degrees_are_suspected():
 def test_a_file_without_some_times_or_with_radians_called_degrees_is_asked_about(tmp_path):
     launch = tippe.Launch(0.1, 100.0)
     (tmp_path / "film.csv").write_text("time [s],theta [deg]\n0.1,5.7\n,6.1\n0.3,\n,\n0.5,6.3\n,6.4\n")
-    with pytest.warns(UserWarning, match="2 lines without a time left out, first in line 3"):
+    with pytest.warns(UserWarning, match="2 lines without a time left out, the first in line 3"):
         film = tippe.read_recording(tmp_path / "film.csv", launch=launch)
     np.testing.assert_allclose(film.times, [0.1, 0.5])
     (tmp_path / "film.csv").write_text("time [s],theta [deg]\n0.1,0.1\n0.2,2.9\n")

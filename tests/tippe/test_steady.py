@@ -258,7 +258,7 @@ REFUSED = {
     "no scene": (lambda: steady.jellett_thresholds(TOP_SCENE.body), r"scene = Top\(.*must be a Scene"),
     "another body": (
         lambda: steady.standing_state(tippe.Scene(RIGID), 10.0),
-        "body = Ellipsoid must be a body of revolution, a Top or a SpheroidBody",
+        "body = Ellipsoid must be a body of revolution, such as a Top",
     ),
     "a word for the spin": (lambda: steady.standing_state(TOP_SCENE, "fast"), "spin = 'fast' is not a number"),
     "several spins": (

@@ -18,7 +18,18 @@ from nonholonomic.geometry.vector import cross, dot, none_if_zero, scale, sum_ve
 from nonholonomic.integration import Components, States
 from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import Stated, likely_fix, shown
-from nonholonomic.validation import Bound, Bounded, Usual, as_number, explaining, largest, require, require_kind, warn
+from nonholonomic.validation import (
+    Bound,
+    Bounded,
+    Usual,
+    as_number,
+    explaining,
+    largest,
+    require,
+    require_all,
+    require_kind,
+    warn,
+)
 
 from ..friction import A_LAW, AbstractFriction, Frictionless, NoSlip, SetValuedCoulomb, as_law
 from .body import AbstractBody, Top
@@ -363,8 +374,7 @@ class Scene(Bounded, Generic[Body]):
 
     def check_start(self, launch: Launch) -> None:
         """Raise `ValueError` if a launch has no place on this arena."""
-        for bound in self.start_bounds(launch):
-            bound.require()
+        require_all(self.start_bounds(launch))
 
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
         """The ranges of a launch's numbers on this arena.

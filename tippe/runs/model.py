@@ -255,7 +255,9 @@ class TopModel(AbstractSceneModel):
                 "angle=0.95 * math.pi, or take crossing = 'first'"
             )
         if nested and not self.smooth:
-            raise ValueError("second derivatives do not exist through changes of mode ('hybrid', SetValuedCoulomb)")
+            raise ValueError(
+                "second derivatives do not exist through changes of mode: contact = 'hybrid', SetValuedCoulomb"
+            )
 
     @property
     def further_times(self) -> dict[str, tuple[str, AbstractModel]]:

@@ -24,12 +24,11 @@ from nonholonomic.integration.problem import (
     Status,
     require_run,
     require_times,
-    run_bounds,
 )
 from nonholonomic.parameters import full_axes, numbers, with_numbers
 from nonholonomic.runs.attractors import LyapunovExponent, exponent_of_model
 from nonholonomic.runs.event import EventTime, time_of_event
-from nonholonomic.runs.model import Number, settings_for_lanes
+from nonholonomic.runs.model import Number, check_horizon, settings_for_lanes
 from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_sensitivities, samples_of
 from nonholonomic.runs.table import TableForm, TableJob
 from nonholonomic.sweeps import Axis, Table, axis
@@ -140,7 +139,9 @@ def check_smooth(scene: Scene, caller: str) -> None:
         raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table supports flights")
     if scene.friction.set_valued:
         kind = type(scene.friction).__name__
-        raise ValueError(f"friction = {kind} must be a law with a single mode for {caller}; inversion_table has others")
+        raise ValueError(
+            f"friction = {kind} must be a law with a single mode for {caller}; inversion_table supports others"
+        )
 
 
 def require_rigid(scene: Scene) -> None:
@@ -442,7 +443,9 @@ def event_table(
     model = TopModel.timed(**roots, angle=angle)
     names = full_sensitivities(model, options.sensitivities, crossing)
     if not model.smooth and method == "diffrax":
-        raise ValueError("method = 'diffrax' has no runs of several modes: contact = 'hybrid' or SetValuedCoulomb")
+        raise ValueError(
+            "method = 'diffrax' does not support runs of several modes: contact = 'hybrid' or SetValuedCoulomb"
+        )
     check_cells(model, grid, options)
     axis_values = {axis.number: axis.values for axis in grid}
     if angle is None:
@@ -787,8 +790,7 @@ def lyapunov_exponent(
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
     require_outside((scene, launch, t1, tolerance), "lyapunov_exponent", "lists in the launch in place of vmap")
-    for bound in run_bounds(t1, tolerance):
-        bound.require()
+    check_horizon(t1, tolerance)
     settings = settings_for_lanes(tolerance, solver)
     shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}
     if len(shapes) > 1 or any(len(shape) > 1 for shape in shapes):

@@ -98,7 +98,7 @@ def test_a_number_that_does_not_act_is_seen_at_once():
     with pytest.warns(FitWarning) as caught:
         fit = fitted_with_limit(100.0, 1e-13)
     assert [str(warning.message) for warning in caught] == [
-        "no prediction depends on level, so the data say nothing about it: fix it, or add data",
+        "no prediction depends on level, so the data say nothing about it: fix it, or add other data",
         "the data do not determine level +0.001",
     ]
     assert len(fit.distribution.points) == 256
@@ -130,7 +130,7 @@ def test_estimated_errors_are_those_of_the_scatter():
     assert_close(fit.standard_errors["a"], np.std(value[:40], ddof=1) / math.sqrt(40.0), rtol=0.01)
     assert_close(fit.standard_errors["b"], np.std(value[40:], ddof=1) / math.sqrt(40.0), rtol=0.01)
     assert math.isnan(fit.verdict.p_value)
-    assert "its errors were" in fit.details
+    assert "the errors were estimated from it" in fit.details
 
 
 @pytest.mark.parametrize("swapped", [False, True])

@@ -158,7 +158,7 @@ def test_runs_overlaid_have_colours_of_their_own():
             lambda system, t, y: [Box((0.0, 0.0, 0.0), 1.0)],
             r"lengths in Box must be three numbers, .*not of shape \(\)",
         ),
-        ("red", r"draw = 'red' must be a function draw\(system, t, y\) for an own system"),
+        ("red", r"draw = 'red' must be a function draw\(system, t, y\) for your own system"),
     ],
 )
 def test_wrong_drawings_are_refused(draw, problem):

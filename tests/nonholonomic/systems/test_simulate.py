@@ -387,7 +387,7 @@ def test_texts_are_not_numbers(start):
 
 
 def test_a_number_of_times_is_not_their_list():
-    with pytest.raises(ValueError, match=r"times = 11 must be a list of numbers; np\.linspace"):
+    with pytest.raises(ValueError, match=r"times = 11 must be a list of at least one number; np\.linspace"):
         simulate(Hybrid([Ball()]), [1.0, 0.0, 0.0], 1.0, times=11)
 
 
