@@ -215,7 +215,11 @@ class Branch(eqx.Module):
         for k, kind in enumerate(self.kinds):
             if kind != REGULAR:
                 panel.plot(x[k], y[k], "o", color="C3", markersize=4)
-                panel.annotate(kind, (x[k], y[k]), xytext=(5, 5), textcoords="offset points", fontsize="small")
+                # Beside the line, towards the middle of the picture.
+                is_right, (old, new) = x[k] > np.mean(panel.get_xlim()), (max(k - 1, 0), min(k + 1, len(x) - 1))
+                is_above = is_right == ((x[new] - x[old]) * (y[new] - y[old]) > 0.0)
+                style = {"ha": "right" if is_right else "left", "fontsize": "small", "textcoords": "offset points"}
+                panel.annotate(kind, (x[k], y[k]), (-5 if is_right else 5, 5 if is_above else -12), **style)
         panel.set_xlabel(short_names([self.name])[self.name])
         panel.set_ylabel(table.label(quantity))
         panel.legend()
