@@ -9,6 +9,8 @@ from importlib.util import find_spec
 from types import TracebackType
 from typing import Any, ClassVar
 
+import jax
+
 from .compilation.cache import forget_programs_if_many, is_off
 
 #: How often the line is written [s] (a shorter call shows nothing), how often the thread checks whether the line is due
@@ -18,6 +20,9 @@ INTERVAL, TICK, LINGER = 0.5, 0.1, 5.0
 
 #: Where nobody watches, in a log or in the window of an editor, the time [s] after which a call writes a line that stays.
 PATIENCE = 2.0
+
+#: The time [s] after which a call that still compiles says how long that takes and how often it happens.
+EXPLAINED = 3.0
 
 #: Functions of JAX that run while a program is traced or compiled: module, and start of the function's name.
 COMPILERS = (
@@ -119,6 +124,10 @@ class Progress:
             module, name = frame.f_globals.get("__name__"), frame.f_code.co_name
             compiling = any(module == compiler and name.startswith(begin) for compiler, begin in COMPILERS)
             frame = frame.f_back
+        words = "compiling" if compiling else self._doing
+        if compiling and self._written - self._start > EXPLAINED:
+            often = " (kept on disk)" if getattr(jax.config, "jax_compilation_cache_dir", None) else " and session"
+            words += f", usually up to 30 s, once for each kind of call{often}"
         if not self._watched:
             Progress._has_told, doing = True, "compiling, the first time only" if compiling else self._doing
             print(f"nonholonomic: {doing} (NONHOLONOMIC_PROGRESS=0 hides this line)", file=sys.stderr)
@@ -129,7 +138,7 @@ class Progress:
             if self._bar is None:
                 self._bar = self._tqdm(bar_format="{desc} [{elapsed}]", **options)
                 self._bar.start_t = self._start
-            self._bar.set_description_str("compiling" if compiling else self._doing, refresh=False)
+            self._bar.set_description_str(words, refresh=False)
         else:
             if self._bar is None:
                 # The rate is that of the whole run without the preparations, because chunks of items differ in cost.

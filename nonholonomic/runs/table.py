@@ -33,6 +33,7 @@ class TableForm(NamedTuple):
     - `event`: what the event is, for descriptions of variables.
     - `run`: the word for a run in descriptions.
     - `time`: name of the variable of the event's time; `order`: the variables in order, by default as they come.
+    - `left_open`: what a run that ends at the first event leaves open, if it is to be said.
     - `nan_if_failed`: whether the time of a run without a result is NaN; otherwise it is infinite.
     """
 
@@ -42,6 +43,7 @@ class TableForm(NamedTuple):
     time: str = "time"
     run: str = "run"
     order: tuple[str, ...] | None = None
+    left_open: str = ""
 
     @property
     def codes(self) -> np.ndarray:
@@ -93,6 +95,8 @@ class TableJob(NamedTuple):
         event = self.form.event
         words = {f"{name}_time": f"{name} {event} time" for name in ("first", "last")}
         words[self.form.time] = {"event": "time of the event", "loss of contact": event}.get(event, f"{event} time")
+        if self.form.left_open:
+            words[self.form.time] = f"{self.crossing} {event} time"
         words = {name: words[name] for name in self.times}
         words |= {name: text for name, (text, _) in self.model.further_times.items()}
         variables = {name: Variable("s", np.float64, long_name=text) for name, text in words.items()}
@@ -112,8 +116,9 @@ class TableJob(NamedTuple):
     def _ending(self, ends: dict[str, Variable]) -> dict[str, Variable]:
         """The variables that describe how a run ended."""
         counts = COUNTED | self.model.counters
+        remark = f"; {self.form.left_open}" if self.form.left_open and not self.continues else ""
         of_end = {
-            "status": Variable("1", np.int8, WORDS, long_name=f"how the {self.form.run} ended"),
+            "status": Variable("1", np.int8, WORDS, long_name=f"how the {self.form.run} ended{remark}"),
             "end_time": Variable("s", np.float64, long_name=f"end of the {self.form.run}"),
         }
         return of_end | ends | {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}

@@ -101,6 +101,14 @@ class Table(eqx.Module):
         """The units in which texts and pictures show the numbers: those of the launch, if it was stated in others."""
         return tuple(json.loads(self.attributes.get(SHOWN_IN, "[]")))
 
+    @property
+    def inverted_for_a_time(self) -> Values:
+        """Whether the top of each cell was inverted and is not at the end; only a table of both crossings tells, and in
+        others this is false."""
+        if not {"first_time", "status"} <= set(self.variables):
+            return np.zeros(self.shape, bool)
+        return np.isfinite(self.variables["first_time"]) & (self.variables["status"] == "not_inverted")
+
     def label(self, name: str) -> str:
         """The label of a coordinate or variable for plots: its long name with its unit, "inversion time [s]"."""
         unit = readable_unit(self.units.get(name, "1"))
@@ -325,7 +333,7 @@ class Table(eqx.Module):
         return dataclasses.replace(
             self,
             coords=converted(self.coords, list(self.coords)),
-            variables=converted(self.variables, [*chosen, "status"]),
+            variables=converted(self.variables, [*chosen, "status", "first_time"]),
             units={name: text for name, (text, _) in units.items()},
         )
 
@@ -346,6 +354,11 @@ class Table(eqx.Module):
             unit = readable_unit(shown_table.units.get(name, "1"))
             dims = "".join(f" x {dim} ({len(self.coords[dim])})" for dim in self.inner.get(name, ()))
             summary = _summary(values if name == "status" else values[computed])
+            if name == "status":
+                count, remark = np.sum(self.inverted_for_a_time), self.long_names.get(name, "").partition("; ")[2]
+                summary += (f", of which {count} inverted for a time" if count else "") + (
+                    f" ({remark})" if remark else ""
+                )
             rows.append((f"{name}{f' [{unit}]' if unit else ''}{dims}", summary, self.long_names.get(name, "")))
         return title, rows
 

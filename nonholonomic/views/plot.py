@@ -110,12 +110,23 @@ def draw_table(
     visible = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
     # The statuses of the drawn cells, if each has one.
     has_status = "status" in table.variables and not table.inner.get(variable)
-    words = _slice(table.variables["status"], dims, names, cut) if has_status else None
+    words, fell = None, np.zeros(visible.shape, bool)
+    if has_status:
+        words, fell = (
+            _slice(part, dims, names, cut) for part in (table.variables["status"], table.inverted_for_a_time)
+        )
+        words = np.where(fell, "inverted for a time", words)
     drawing = new_figure().add_subplot() if ax is None else ax
     cuts = [_cut_text(table, name, place, at.get(name)) for name, place in cut.items()]
     is_diagram = x is None and len(names) == 2 and names[0] == "crossing"
     is_map = len(names) == 2 and not is_diagram and (y is not None or len(table.coords[names[1]]) > MOST_LINES)
     drawing.set_ylabel(table.label(names[1] if is_map else variable))
+    if np.any(marked := fell & np.isfinite(visible)):
+        # Cells with a value whose top was inverted only for a time.
+        abscissa = np.broadcast_to(table.coords[names[0]], visible.T.shape).T
+        ordinate = np.broadcast_to(table.coords[names[1]], visible.shape) if is_map else visible
+        style = {"color": "white", "markeredgecolor": "0.2", "markersize": 6, "linestyle": "", "zorder": 3}
+        drawing.plot(abscissa[marked], ordinate[marked], ".", label="inverted for a time", **style)
     if is_map:
         cuts = [label, *cuts] if label else cuts
         _draw_map(drawing, table, names, visible, table.label(variable), log, values.dtype.kind in "iu")
@@ -281,7 +292,7 @@ def _mark_words(drawing: "Axes", table: "Table", names: list[str], words: np.nda
             table.coords[names[0]], table.coords[names[1]], mask.T, shading="nearest", cmap=ListedColormap([grey])
         )
         patches.append(Patch(color=grey, label=word.replace("_", " ")))
-    if patches:
+    if patches := [*drawing.get_legend_handles_labels()[0], *patches]:
         # Below the label of the horizontal axis, where it covers no cell.
         place = {"loc": "upper left", "bbox_to_anchor": (0.0, 0.0), "borderaxespad": 4.2}
         drawing.legend(handles=patches, ncols=3, fontsize="small", **place)

@@ -26,7 +26,7 @@ from nonholonomic.text import Unit, distinguishing_labels
 
 from ..model.dynamics import Power, State, padded
 from ..model.input import Input
-from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, RideProblem, Scene
+from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, Scene
 
 # The quantities of a ride, with units and names, as functions of its states, and the table of a run.
 
@@ -282,10 +282,7 @@ def followed(spec: RideSpec) -> tuple[Steps, Stats]:
     return steps, Stats(*map(jnp.asarray, counts))
 
 
-@eqx.filter_jit
-def _problem(model: Any) -> RideProblem:
-    return model.problem(None, None)
-
+_problem = eqx.filter_jit(lambda model: model.problem(None, None))
 
 _sample = compiled_quickly(sample)
 
@@ -479,6 +476,7 @@ class Trajectory(AbstractRun):
         jackknives = self.jackknifed_at
         lines = [
             f"Trajectory of {self.t.size} times, {float(self.t[0]):g} s to {float(self.t[-1]):g} s: {self.status}",
+            f"  launch          {self.model.launch}",
             f"  steps           {int(self.stats.steps)} accepted, {int(self.stats.rejected)} rejected",
             f"  end             place {shown(self.place[-1])}, heading {float(self.heading[-1]):.6g} rad, "
             f"speed {float(self.speed[-1]):.6g} m/s, steering {float(self.steering[-1]):.6g} rad",

@@ -113,6 +113,28 @@ def test_what_is_told_is_whether_a_program_is_being_made(monkeypatch):
     assert left(terminal) == ""
 
 
+@pytest.mark.parametrize(("folder", "often"), [(None, " and session"), ("/programs", " (kept on disk)")])
+def test_a_long_compilation_says_how_long_it_takes_and_how_often(folder, often, monkeypatch):
+    terminal = watched(monkeypatch)
+    monkeypatch.setattr(progress_module, "EXPLAINED", 0.2)
+    # The line finds out that JAX compiles by the functions that are running.
+    monkeypatch.setattr(progress_module, "COMPILERS", ((__name__, "sleep_as_a_compiler"),))
+    own_folder = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", folder)
+    try:
+        with status_line("simulating"):
+            sleep_as_a_compiler()
+    finally:
+        jax.config.update("jax_compilation_cache_dir", own_folder)
+    lines = [text.partition(" [")[0] for _, text in terminal.lines if text.strip()]
+    assert lines[0] == "compiling"
+    assert lines[-1] == f"compiling, usually up to 30 s, once for each kind of call{often}"
+
+
+def sleep_as_a_compiler():
+    time.sleep(0.5)
+
+
 def test_a_line_within_a_line_does_not_garble_it(monkeypatch):
     """A context that counts items owns the line until it ends; a context that does not count leaves the line unchanged."""
     terminal = watched(monkeypatch)

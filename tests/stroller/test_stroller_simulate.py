@@ -291,5 +291,13 @@ def test_what_happened_in_a_traced_ride_is_found_by_riding_again():
 
 def test_trajectory_reads_well(reference):
     text = str(reference)
-    for words in ("11 times, 0 s to 10 s: completed", "energy", "residual", "normal force", "side forces", "no-slip"):
+    for words in (
+        "11 times, 0 s to 10 s: completed",
+        "Launch(place=(",
+        "energy",
+        "residual",
+        "normal force",
+        "side forces",
+        "no-slip",
+    ):
         assert words in text

@@ -129,7 +129,9 @@ def test_a_portrait_draws_one_quantity_over_another(run):
 
 
 def test_a_run_shows_itself(run):
-    assert "completed at 1 s" in repr(run)
+    assert "completed at 1 s\n  Launch(theta=0.1 rad, spin=155 rad/s, eta=0 rad, azimuth=0 rad)\n  theta: 0.1" in repr(
+        run
+    )
     assert "completed at 1 s" in run._repr_html_()
 
 

@@ -289,10 +289,10 @@ def test_a_frictionless_scene_has_no_mu_to_vary():
 
 def test_a_table_prints_and_draws(table):
     assert "theta (3), spin (2)" in str(table)
-    assert "6 inverted" in str(table)
+    assert "6 inverted (runs end when first inverted, and crossing='both' tells which stay so)" in str(table)
     figure = table.plot()
     assert figure.axes[0].get_xlabel() == "θ(0) [rad]"
-    assert figure.axes[0].get_ylabel() == "inversion time [s]"
+    assert figure.axes[0].get_ylabel() == "first inversion time [s]"
     with pytest.raises(ValueError, match="variable = 'status' must be a numeric variable"):
         table.plot("status")
     with pytest.raises(AttributeError, match="the table has no 'tme'; it has time"):
@@ -311,6 +311,9 @@ def test_first_and_last_crossing_come_from_one_run(arena):
     assert_close(table.first_time, first.time, rtol=1e-11)
     assert_close(table.last_time, last.time, rtol=1e-11)
     assert table.status.tolist() == last.status.tolist()
+    # These runs do not end at the first crossing.
+    assert "(runs end" not in str(table) + str(last)
+    assert last.label("time") == "last inversion time [s]"
     assert np.isfinite(table.first_time).any()
     if isinstance(arena, tippe.Cylinder):
         assert (table.last_time > table.first_time).any()

@@ -112,7 +112,10 @@ def variable_numbers(scene: Scene) -> list[str]:
 
 #: The names in tables of inversion times and of reversal times.
 INVERSIONS = TableForm(
-    {Status.EVENT: Status.INVERTED, Status.COMPLETED: Status.NOT_INVERTED}, "inversion", nan_if_failed=False
+    {Status.EVENT: Status.INVERTED, Status.COMPLETED: Status.NOT_INVERTED},
+    "inversion",
+    nan_if_failed=False,
+    left_open="runs end when first inverted, and crossing='both' tells which stay so",
 )
 REVERSALS = TableForm(
     {Status.EVENT: Status.REVERSED, Status.COMPLETED: Status.NOT_REVERSED}, "reversal", nan_if_failed=False

@@ -368,6 +368,7 @@ class AbstractTrajectory(AbstractRun):
         angle, factor = in_unit("rad", unit_of(self))
         lines = [
             f"Trajectory of {len(self.t)} times, {word} at {float(self.end_time):.6g} s",
+            *([] if self.launch is None else [f"  {self.launch}"]),
             f"  theta: {factor * float(self.theta[0]):.6g} to {factor * float(self.theta[-1]):.6g} {angle}",
         ]
         if self.dense is not None and isinstance(self.scene.body, AbstractBody):

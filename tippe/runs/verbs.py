@@ -290,7 +290,8 @@ def inversion_table(
     - `crossing`: "first" for the first time theta reaches the angle; "last" for the crossing after which theta stays
       above the angle until `t1` (if theta oscillates, first crossings are ill-conditioned), or, for the contact of a
       stem, the time after which the sphere does not touch until `t1`; "both" for both times from one run: the variables
-      `first_time` and `last_time` replace `time`, and the status is that of the last crossing.
+      `first_time` and `last_time` replace `time`, the status is that of the last crossing, and texts and pictures tell
+      tops that were inverted for a time from the others (`table.inverted_for_a_time`).
     - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
     - `axes`: additional axes, name of a parameter -> values. The end of a full name is enough if it is unique, such as
       `{"offset": [0.005, 0.006]}` for `"scene.body.offset"`.
@@ -317,9 +318,10 @@ def inversion_table(
     - `time` [s]: the inversion time, infinite if the top did not invert.
     - `stem_time` [s], for a top with a stem: when the stem first carries it, infinite if it does not by `t1`, whatever the
       angle. In a flight the stem carries nothing until it lands.
-    - `status`: "inverted", "not_inverted" by `t1`, "contact_lost", "failed", "jammed", or "unresolved" (the energy grows;
-      with `contact="hybrid"`, also 10 000 flights in a row, or sphere and stem on the plane together with so much
-      friction that the forces are undetermined; with `SetValuedCoulomb`, also too many changes between slip and rolling).
+    - `status`: "inverted" (for the first time, if `crossing` is "first": the run ends there), "not_inverted" by `t1`,
+      "contact_lost", "failed", "jammed", or "unresolved" (the energy grows; with `contact="hybrid"`, also 10 000 flights
+      in a row, or sphere and stem on the plane together with so much friction that the forces are undetermined; with
+      `SetValuedCoulomb`, also too many changes between slip and rolling).
     - `end_time` [s], `end_theta` [rad]: when and at which inclination the run ended, also if contact was lost or jammed.
     - `steps`, `rejected`: numbers of integration steps.
     - `hops`, with `contact="hybrid"`: number of flights until the run ended. The run continues through flights, and may
