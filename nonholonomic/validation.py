@@ -377,10 +377,13 @@ class Usual(NamedTuple):
         unit, degrees = f" {readable_unit(unit)}".rstrip(), IN_DEGREES.format(f"{number:g}")
         if number > 2.0 * math.pi * self.turns:
             raise ValueError(f"{name} = {shown(value)} must be within [-2 pi, 2 pi]{degrees}")
+        large = f"{name} = {number:.4g}{unit} is large"
         if not self.others:
-            return f"{name} = {number:.4g}{unit} is large{degrees}"
+            # Whole tenths of a degree, such as pi / 2, were converted.
+            tenths = 10.0 * math.degrees(number)
+            return None if math.isclose(tenths, round(tenths), rel_tol=1e-12) else large + degrees
         words = ", ".join(f"{number:.4g} {other} are {size * number:.4g}{unit}" for other, size in self.others.items())
-        return f"{name} = {number:.4g}{unit} is large: was it in {' or '.join(self.others)}? {words}"
+        return f"{large}: was it in {' or '.join(self.others)}? {words}"
 
 
 class Bound(NamedTuple):
@@ -493,20 +496,21 @@ class Bounded(eqx.Module, metaclass=Explaining):
 
     def __check_init__(self):
         # The module's own numbers are scalars or lists of one length; the arrays of a user's class may have any shapes.
-        shapes = {}
+        arrays = {}
         for field in dataclasses.fields(self) if not is_users(type(self)) else ():
             for name, part in _parts(field.name, getattr(self, field.name)).items():
                 if isinstance(part, jax.Array | np.ndarray):
-                    shapes[name] = np.shape(part)
-                    if 0 in shapes[name]:
+                    arrays[name] = part
+                    if 0 in np.shape(part):
                         raise ValueError(f"{name} = [] must be a number, not an empty list")
         try:
-            np.broadcast_shapes(*shapes.values())
+            np.broadcast_shapes(*map(np.shape, arrays.values()))
         except ValueError:
-            lists = ", ".join(f"{name} of shape {shape}" for name, shape in shapes.items() if shape)
+            arrays = {name: part for name, part in arrays.items() if np.ndim(part)}
+            lists = ", ".join(f"{name} of shape {np.shape(part)}" for name, part in arrays.items())
             raise ValueError(
-                f"{type(self).__name__}: {lists}: the numbers of one object must be scalars or lists of equal length; "
-                "for all combinations, give the lists to a table by name: inversion_table(scene, theta=[...], spin=[...])"
+                f"{type(self).__name__}: {lists}: the numbers of one object must be scalars or lists of equal length; for a "
+                f"table of all combinations, leave single numbers here and pass it axes={shown(arrays)}, in SI units"
             ) from None
         require_all(self.bounds())
         # Copies that our threads make of the user's modules repeat no warning.

@@ -143,7 +143,9 @@ REFUSED = {
     ),
     "a launch of three thetas and two spins": (
         lambda: tippe.Launch([0.1, 0.2, 0.3], [100.0, 150.0]),
-        "Launch: theta of shape (3,), spin of shape (2,): the numbers of one object must be scalars or lists of equal length",
+        "Launch: theta of shape (3,), spin of shape (2,): the numbers of one object must be scalars or lists of equal length; "
+        "for a table of all combinations, leave single numbers here and pass it axes={'theta': [0.1, 0.2, 0.3], 'spin': "
+        "[100, 150]}, in SI units",
     ),
     "a ride of two speeds and three places": (
         lambda: stroller.Launch(([0.0, 1.0, 2.0], 0.0), 0.3, [1.0, 2.0]),

@@ -97,6 +97,8 @@ SUSPECTED = {
         "theta = 3 rad is large; angles are in radians: did you mean np.rad",
     ),
     "whole degrees of several": (lambda: tippe.Launch([2.0, 3.0], 155.0), "did you mean np.radians(3)?"),
+    "a tilt in degrees": (lambda: tippe.Plane(1.5), "tilt = 1.5 rad is large; angles are in radians: did you mean"),
+    "two degrees": (lambda: tippe.Launch(2.0, 155.0), "theta = 2 rad is large; angles are in radians: did you mean"),
     "degrees of the azimuth": (
         lambda: tippe.Launch(0.1, 155.0, azimuth=90.0),
         "azimuth = 90 rad is large; angles are in",
@@ -235,6 +237,14 @@ def test_what_is_usual_is_not_suspected(nothing_runs):
     tippe.Launch(0.1, [-900.0, 900.0])
     tippe.Launch.degrees(0.5, 900.0, azimuth=360.0)
     tippe.Launch(2.5, 155.0)
+    tippe.Launch(1.0, 155.0, azimuth=6.0 * np.pi)
+    tippe.Launch([0.5, 1.0, 1.5, 2.0], 155.0)
+    # A wall, and a slope of 60 degrees.
+    stroller.Plane(np.pi / 2.0)
+    tippe.Scene(rutstam_top(), tippe.Plane(-np.radians(60.0)), tippe.Viscous(0.3))
+    # Balls of 20 kg/m^3, of a foam, and a football.
+    for mass, radius in ((6.7e-4, 0.02), (0.0105, 0.05), (0.43, 0.11)):
+        tippe.Top(mass, radius, 0.0, 0.4 * mass * radius**2, 0.4 * mass * radius**2)
     tippe.Launch(2.0, 0.0)
     tippe.Coulomb(0.1, 0.2)
     tippe.Coulomb(0.0, 0.3)

@@ -22,7 +22,7 @@ from ..integration.problem import DEFAULT_MAX_STEPS, Status
 from ..sweeps import Axis, Table, Variable
 from ..terminal import status_line
 from ..text import shown
-from ..validation import Bound, explaining, require_outside, require_whole
+from ..validation import Bound, explaining, require_outside, require_whole, warn
 from .crossings import crossings
 from .event import UNMEASURED, modes_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, check_run, model_of, settings_for_lanes
@@ -406,7 +406,7 @@ def bifurcation(
 
     **Returns:** a `Table` as that of `crossings`, over the number and the axis `crossing`.
 
-    **Raises:** as `crossings`, and `ValueError` for several axes.
+    **Raises:** as `crossings`, and `ValueError` for several axes. A warning counts the runs that ended early.
 
     **Example:** the logistic map, once a second: one value, and beyond 3 two.
 
@@ -437,7 +437,13 @@ def bifurcation(
     """
     if not isinstance(axes, dict) or len(axes) != 1:
         raise ValueError(f"axes = {shown(axes)} must name one parameter and its values; crossings takes several")
-    return crossings(system, start, t1, event, count, skip, axes=axes, **options)
+    table = crossings(system, start, t1, event, count, skip, axes=axes, **options)
+    words = np.ravel(table.status).tolist()
+    early = [word for word in words if word not in (Status.EVENT.word, Status.COMPLETED.word, Status.ILLEGAL.word)]
+    if early:
+        kinds = ", ".join(dict.fromkeys(early))
+        warn(f"{len(early)} of {len(words)} runs ended early ({kinds}): the diagram lacks their last returns")
+    return table
 
 
 #: What is known of each quantity, as the ends of the names of variables.
@@ -515,10 +521,11 @@ def basins(
     - `resolution`: difference below which values are the same, as a fraction of the range of the quantity: in a usual run, or
       over the attractors if that is more.
 
-    **Returns:** a `Table` with `attractor`: 1 for that of most cells, 2 for the next and so on, 0 where a run has not settled
-    or ended before `t1`; for each quantity, such as `y0`, its least and greatest values in the last quarter of the run as
-    `y0_min` and `y0_max`, their greatest change from the quarter before as `y0_change`, and the range of the whole run as
-    `y0_range`; `status`, `end_time`, `steps`, `rejected`. `plot("attractor")` draws a map.
+    **Returns:** a `Table` with `attractor`: 1 for that of most cells, 2 for the next and so on, 0 where a run has not
+    settled by `t1`, and -1 where it ended before, as `status` says ("unresolved" where it came to rest by ever shorter
+    bounces); for each quantity, such as `y0`, its least and greatest values in the last quarter of the run as `y0_min` and
+    `y0_max`, their greatest change from the quarter before as `y0_change`, and the range of the whole run as `y0_range`;
+    `status`, `end_time`, `steps`, `rejected`. `plot("attractor")` draws a map.
 
     **Raises:** as `sweep`.
 
@@ -565,7 +572,7 @@ def basins(
         table,
         variables={"attractor": attractors_of(table, tuple(names), resolution, tolerance), **table.variables},
         units=table.units | {"attractor": "1"},
-        long_names=table.long_names | {"attractor": "attractor"},
+        long_names=table.long_names | {"attractor": "attractor (0: not settled, -1: run ended early)"},
     )
 
 
@@ -589,7 +596,7 @@ def attractors_of(table: Table, names: tuple[str, ...], resolution: float, toler
         step = max(resolution * (max(high - low, np.median(whole[completed])) or 1.0), errors)
         has_settled &= change <= step
         rows += [part / step for part in (least, greatest)]
-    number = np.zeros(np.shape(completed), int)
+    number = np.where(completed, 0, -1)
     if not has_settled.any():
         return number
     places = np.round(np.stack([row[has_settled] for row in rows], axis=-1))

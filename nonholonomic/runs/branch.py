@@ -187,7 +187,8 @@ class Branch(eqx.Module):
 
     def plot(self, quantity: str = "period", ax: Any = None) -> Any:
         """Draw a quantity over the number (needs matplotlib), with solid lines for stable orbits, dashed lines for unstable
-        ones, and the names of the special points.
+        ones, and the names of the special points. A component is that of one state of each orbit, so that of the two prongs
+        of a doubled orbit one is drawn; `bifurcation` draws both.
 
         **Arguments:** `quantity`: "period", or the name of a component; `ax`: matplotlib axes to draw in, instead of a new
         figure.

@@ -112,9 +112,7 @@ def draw_table(
     has_status = "status" in table.variables and not table.inner.get(variable)
     words, fell = None, np.zeros(visible.shape, bool)
     if has_status:
-        words, fell = (
-            _slice(part, dims, names, cut) for part in (table.variables["status"], table.inverted_for_a_time)
-        )
+        words, fell = (_slice(part, dims, names, cut) for part in (table["status"], table.inverted_for_a_time))
         words = np.where(fell, "inverted for a time", words)
     drawing = new_figure().add_subplot() if ax is None else ax
     cuts = [_cut_text(table, name, place, at.get(name)) for name, place in cut.items()]
@@ -256,7 +254,9 @@ def _draw_map(
     values = visible[np.isfinite(visible) & (visible > 0.0)] if log else visible[np.isfinite(visible)]
     x, y = table.coords[names[0]], table.coords[names[1]]
     if is_whole and not log and len(kinds := np.unique(values)) <= MOST_COLOURS:
-        colours = ListedColormap(["0.85" if kind == 0 else f"C{number}" for number, kind in enumerate(kinds)])
+        # Numbers up to 0 count nothing: an attractor that is not reached, or no flights.
+        greys = {0: GREYS[0], -1: GREYS[2]}
+        colours = ListedColormap([greys.get(int(kind), f"C{number}") for number, kind in enumerate(kinds)])
         image = drawing.pcolormesh(x, y, np.searchsorted(kinds, visible.T), shading="nearest", cmap=colours)
         image.set_clim(-0.5, len(kinds) - 0.5)
         bar = drawing.figure.colorbar(image, ax=drawing, label=label, ticks=range(len(kinds)))

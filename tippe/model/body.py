@@ -203,11 +203,11 @@ INERTIAS = {"": 1.0, "in kg cm^2": 1e-4, "in kg mm^2": 1e-6, "in g cm^2": 1e-7, 
 
 #: Least density of the material of a turned top that is not suspicious [kg/m^3].
 LEAST_DENSITY = 50.0
-#: Mean densities [kg/m^3]: below that of a table-tennis ball, and above that of osmium.
-LEAST_MEAN, GREATEST_DENSITY, BRASS = 80.0, 23_000.0, 9000.0
-#: The radius [m] above which another unit is suspected, the greatest that it may have in that unit, and the plausible
-#: range of I1 / (m R^2).
-GREATEST_RADIUS, GREATEST_TOY = 1.0, 0.1
+#: Mean densities [kg/m^3]: below that of a table-tennis ball, of a light wood, above that of osmium, and of brass.
+LEAST_MEAN, LEAST_WOOD, GREATEST_DENSITY, BRASS = 80.0, 320.0, 23_000.0, 9000.0
+#: The radius [m] above which another unit is suspected, the greatest that it may have in that unit, the greatest of half a
+#: diameter, and the plausible range of I1 / (m R^2).
+GREATEST_RADIUS, GREATEST_TOY, SMALL_TOY = 1.0, 0.1, 0.04
 RATIOS = (0.1, 2.0)
 
 
@@ -407,7 +407,7 @@ class Top(AbstractBody):
             within = (mean >= least) & (mean < GREATEST_DENSITY) & (part >= RATIOS[0]) & (part <= RATIOS[1])
             return bool(np.all(within & (r * radius <= greatest)))
 
-        # A very light sphere is legal, and suspicious only where half its radius is that of a usual top.
+        # A very light sphere is legal, and suspicious only where with half its radius it is a small one of wood or heavier.
         is_legal = fits(1.0, 1.0, 1.0, 0.0, GREATEST_RADIUS)
         if is_legal and np.all(density >= LEAST_MEAN):
             return None
@@ -418,7 +418,7 @@ class Top(AbstractBody):
         for in_mass, in_length, in_inertia in sorted(options, key=lambda units: sum(map(bool, units))):
             m, r = MASSES[in_mass], LENGTHS[in_length]
             inertia = m * r**2 if in_inertia is None else INERTIAS[in_inertia]
-            if fits(m, r, inertia, LEAST_MEAN, GREATEST_TOY):
+            if fits(m, r, inertia, *((LEAST_WOOD, SMALL_TOY) if is_legal else (LEAST_MEAN, GREATEST_TOY))):
                 in_offset = in_length if np.any(offset >= r * radius) else ""
                 asked = dict(zip(values, (in_mass, in_length, in_offset, in_inertia, in_inertia), strict=True))
                 factors = dict(zip(values, (m, r, LENGTHS[in_offset], inertia, inertia), strict=True))

@@ -160,8 +160,8 @@ class Launch(Stated, Bounded):
         return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others).stated_in(DEGREES)
 
     def suspicion(self) -> str | None:
-        # People write whole degrees; radians are rarely whole numbers.
-        is_whole = largest(self.theta) >= 1.0 and largest(self.spin) > 0.0 and not np.any(np.asarray(self.theta) % 1.0)
+        # People write whole degrees; radians above 1 are rarely whole numbers.
+        is_whole = largest(self.theta) > 1.0 and largest(self.spin) > 0.0 and not np.any(np.asarray(self.theta) % 1.0)
         return Usual(0.0).question("theta", self.theta, "rad") if is_whole else super().suspicion()
 
     def bounds(self) -> Iterator[Bound]:

@@ -464,15 +464,13 @@ def event_table(
         name: "time_by_" + (short if shorts.count(short) == 1 else name.replace(".", "_"))
         for name, short in zip(names, shorts, strict=True)
     }
-    by_diffrax = method == "diffrax"
-    job = TableJob(model, form, float(t1), crossing, settings, slopes, options.errors, by_diffrax=by_diffrax)
+    job = TableJob(model, form, float(t1), crossing, settings, slopes, options.errors, by_diffrax=method == "diffrax")
     table = compute_table(job, grid, request, options)
     warn_of_long_runs(table, float(t1), options.max_steps)
     # Tables whose variables stay in the file are not checked.
-    if model.smooth and isinstance(table.variables, dict):
-        unresolved = np.asarray(table.variables["status"] == "unresolved")
-        if unresolved.any():
-            warn(f"{unresolved.sum()} of {unresolved.size} runs are unresolved: {why_unresolved(smooth=True)}")
+    checked = model.smooth and isinstance(table.variables, dict)
+    if unresolved := np.sum(table.variables["status"] == "unresolved") if checked else 0:
+        warn(f"{unresolved} of {math.prod(table.shape)} runs are unresolved: {why_unresolved(smooth=True)}")
     return table
 
 
@@ -563,7 +561,7 @@ def trajectory_table(
     require(t1, "times[-1]", above=0.0, why="it is the horizon")
     launch_values = {"launch": launch, "theta": theta, "eta": eta, "mu": mu, "spin": spin}
     roots, grid = launches(scene, launch_values, axes, t1, tolerance, taken=QUANTITIES)
-    model = TopModel(scene=roots["scene"], launch=roots["launch"])
+    model = TopModel(**roots)
     check_cells(model, grid, options)
     job = TableJob(model, TableForm(), float(t1), "first", settings, samples=samples, timed=False)
     return compute_table(job, grid, {}, options)

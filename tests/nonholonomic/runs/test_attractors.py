@@ -4,10 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
+from matplotlib.colors import to_hex
 
 import nonholonomic
 import tippe
 from nonholonomic import AbstractMode, Hybrid
+from nonholonomic.runs import attractors
+from nonholonomic.runs.attractors import attractors_of
+from nonholonomic.sweeps import Table
 
 
 class Logistic(AbstractMode):
@@ -114,8 +118,33 @@ def test_a_run_that_has_not_settled_or_cannot_start_has_no_attractor():
     axes = {"rate": [0.01, 1.0, 2.0, 1.0], "start[0]": [1.0, 1.0, 1.0, 2.5]}
     with pytest.warns(UserWarning, match="1 of 4 cells are illegal"):
         table = nonholonomic.basins(Hybrid([Decay(1.0)]), [1.0, 5.0], 60.0, axes=axes, scattered=True, progress=False)
-    assert table.attractor.tolist() == [0, 1, 1, 0]
+    assert table.attractor.tolist() == [0, 1, 1, -1]
     assert table.status.tolist() == ["completed", "completed", "completed", "illegal"]
+
+
+def test_runs_that_ended_are_told_from_those_that_have_not_settled():
+    status = np.array([["completed"] * 12, ["completed"] * 11 + ["unresolved"]])
+    ranges = {"y0_min": 1.0, "y0_max": 1.0, "y0_change": 0.0, "y0_range": 1.0}
+    columns = {name: np.full((2, 12), value) for name, value in ranges.items()} | {"status": status}
+    columns["y0_change"][0, 0] = 1.0
+    numbers = attractors_of(Table({"x": np.arange(2.0), "y": np.arange(12.0)}, columns, {}, {}), ("y0",), 0.05, 1e-6)
+    assert numbers[:, [0, 1, -1]].tolist() == [[0, 1, 1], [1, 1, -1]]
+    axes, bar = Table({"x": np.arange(2.0), "y": np.arange(12.0)}, {"attractor": numbers}, {}, {}).plot().axes
+    assert [text.get_text() for text in bar.get_yticklabels()] == ["-1", "0", "1"]
+    colours = [to_hex(axes.collections[0].cmap(k)) for k in range(3)]
+    assert colours == [to_hex(colour) for colour in ("0.55", "0.85", "C2")]
+
+
+def test_a_diagram_says_how_many_runs_ended_early(monkeypatch):
+    status = np.array(["event", "completed", "unresolved", "failed", "unresolved", "illegal"])
+    monkeypatch.setattr(
+        attractors, "crossings", lambda *_, **__: Table({"rate": np.arange(6.0)}, {"status": status}, {}, {})
+    )
+    with pytest.warns(
+        UserWarning, match=r"3 of 6 runs ended early \(unresolved, failed\): the diagram lacks their"
+    ) as caught:
+        nonholonomic.bifurcation(None, None, 1.0, axes={"rate": [1.0]})
+    assert len(caught) == 1
 
 
 class Cubic(Logistic):
