@@ -445,10 +445,18 @@ def search(explorer: Explorer, starts: int, max_steps: int, progress: bool) -> t
     if problem.step is not None and (recorded or is_bounded):
         # A step by differences takes as long as a round of the exploration, which also finds the minima.
         sample = explorer.explore(pool, None, progress)
-        best = sample.points[sample.most_probable(min(starts, LAST if recorded else 1))]
-        # Among so many points of a single unknown, the best is close to the minimum.
-        steps = min(steps, 1) if sample.enough and not recorded else steps
-        return explorer, refine(density, best, steps, progress), sample
+        place = sample.most_probable(min(starts, LAST if recorded else 1))
+        best = sample.points[place]
+        if recorded or not sample.enough or np.any(np.asarray(measurements.estimated)):
+            return explorer, refine(density, best, steps, progress), sample
+        # Among so many points of a single unknown, the best is close to the minimum, and those around it show the slopes.
+        beside = best[0] + problem.step * np.array([-1.0, 1.0])
+        moved = [np.interp(beside, sample.points[:, 0], column) for column in sample.predictions.T]
+        with np.errstate(invalid="ignore"):
+            slopes = np.diff(moved)[None] / (2.0 * problem.step)
+        slopes = np.where(np.isfinite(slopes) & acts, slopes, 0.0)
+        at_best = weighed(density, best, sample.predictions[place], slopes)
+        return explorer, Minima(best, best, np.array([True]), at_best, density), sample
     # The start; then, in turn, the best for all measurements and for the early ones.
     start = int(np.argmin(np.sum((pool.points - explorer.region.middle) ** 2, axis=1)))
     totals = np.cumsum(pool.groups, axis=1) + pool.log_prior[:, None]

@@ -195,3 +195,9 @@ def test_a_smooth_likelihood_of_one_unknown_takes_few_runs(tooth, least, most):
     assert least < model.runs < most
     low, high = fit.interval("rate")
     assert low < TRUTH < high
+    if tooth == 0.0:
+        # Least squares of a line through zero.
+        values = np.asarray(data.value)
+        assert fit.slope_errors["rate"] == pytest.approx(ERROR / np.linalg.norm(X), rel=0.01)
+        assert fit.most_likely["rate"] == pytest.approx(values @ X / (X @ X), abs=0.1 * fit.slope_errors["rate"])
+        assert fit.standard_errors["rate"] == pytest.approx(fit.slope_errors["rate"], rel=0.05)
