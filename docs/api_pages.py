@@ -217,8 +217,8 @@ MEMBERS = {
     "tippe.ReversalTimes": "measurements",
     "tippe.Free": "start lower upper prior unit",
     "nonholonomic.AbstractMode": "field margin reset",
-    "nonholonomic.AbstractSystem": "dimension metric potential constraints frame force margin reset impact lagrangian "
-    "energy",
+    "nonholonomic.AbstractSystem": "dimension metric potential constraints drift frame force margin reset impact "
+    "lagrangian energy",
     "nonholonomic.integration.AbstractProblem": "leading direction_decides fits_one_kernel start field event_function "
     "crossing_along domain_margin margins",
     "nonholonomic.integration.AbstractPassive": "rates",

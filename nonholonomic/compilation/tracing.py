@@ -198,8 +198,9 @@ COMPARISONS = ["gt", "ge", "lt", "le", "eq", "ne", "lt_to", "le_to"]
 KINKS = ["max", "min", "abs", "sign", "clamp"]
 STAIRS = ["floor", "ceil", "round"]
 
-#: Traced functions that are smooth, whatever their operations: one of JAX, and the splines of plans.
-SMOOTH = ["sinc", "spline_of_a_plan"]
+#: Traced functions that are smooth, whatever their operations, or whose jumps have no effect: one of JAX, the splines of plans,
+#: and the masses for the directions that constraints forbid.
+SMOOTH = ["sinc", "spline_of_a_plan", "with_constraints"]
 
 
 def jumps_of(function: Function, t: PyTree, *others: PyTree) -> tuple[Float[Array, " jumps"], tuple[str, ...]]:

@@ -556,7 +556,7 @@ def basins(
         raise ValueError(
             "quantities = None: name quantities of the scene that tell attractors apart, such as ['theta']"
         )
-    names = tuple(model.quantities) if quantities is None else quantities
+    names = model.names if quantities is None else quantities
     require_names(model.quantities, names)
     vectors = [name for name in names if model.quantities[name].components is not None]
     if vectors or not names:

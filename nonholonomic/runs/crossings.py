@@ -345,7 +345,7 @@ def crossings(
         raise ValueError("event = None: the section of a scene needs event=, a function of time and motion")
     require_event(model)
     check_horizon(t1, tolerance)
-    names = (() if is_scene else tuple(model.quantities)) if quantities is None else quantities
+    names = model.names if quantities is None else quantities
     require_names(model.quantities, names)
     options = Options(tolerance, solver, max_steps, scattered, False, (), path, progress, executor)
     kind, crossing = (CrossingsAfter, "after") if side == "after" else (Crossings, "first")

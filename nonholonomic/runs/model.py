@@ -164,8 +164,9 @@ class AbstractModel(eqx.Module):
 
     # What a state means.
 
-    #: The quantities of a state, by name.
+    #: The quantities of a state, by name; and the names of those that are the components of the state of your own system.
     quantities: ClassVar[dict[str, Quantity]]
+    names: ClassVar[tuple[str, ...]] = ()
 
     #: The variables of a table that describe the end of a run.
     ends: ClassVar[dict[str, Variable]]

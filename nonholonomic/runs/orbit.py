@@ -295,8 +295,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
     def components(self, leaves: Sequence[Array], rows: Float[Array, "rows cells"], mapped: bool = True) -> Array:
         """States of the engine in the components of a start, (components, cells), by default mapped by the symmetry."""
         model: Any = self.model(leaves)
-        parts = model.read(tuple(model.quantities), jnp.asarray(jnp.nan), rows, None)
-        state = jnp.stack([parts[name] for name in model.quantities])
+        parts = model.read(model.names, jnp.asarray(jnp.nan), rows, None)
+        state = jnp.stack([parts[name] for name in model.names])
         if not (self.has_symmetry and mapped):
             return state
         form, values = model.parameters.form, model.parameters.values
@@ -670,7 +670,7 @@ def periodic_orbit(
         model = model.without_event()
     horizon = t1 if period is None else period
     check_run(model, horizon, tolerance)
-    names = tuple(model.quantities)
+    names = model.names
     unknown = [name for name in free or () if name not in names]
     if unknown or (free is not None and (isinstance(free, str) or not len(free))):
         raise ValueError(f"free = {shown(free)} must be a list of some of {', '.join(names)}")

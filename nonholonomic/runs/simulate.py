@@ -339,7 +339,7 @@ def _run_and_extremes(
     """The run, or NaN and "illegal" if a traced number is out of range; and the extremes of its steps, as in
     `integration.Outcome`. **Arguments:** `unchecked`: whether a number is traced."""
     is_legal, status, samples = sampled_if_legal(model, times, t1, settings, were_checked=not unchecked)
-    outcome, names = samples.outcome, tuple(model.quantities)
+    outcome, names = samples.outcome, model.names
     values = model.read(names, times, nan_unless(is_legal, samples.rows), samples.mode)
     is_reached = is_legal & jnp.all(jnp.isfinite(samples.rows), axis=0)
     mode = jnp.where(is_reached, 0 if samples.mode is None else samples.mode, -1)

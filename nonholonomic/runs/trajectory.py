@@ -606,7 +606,7 @@ class Trajectory(AbstractRun):
         **Raises:** `ValueError` for a batch of runs.
         """
         require_one_run(self, "to_table", "; nonholonomic.sweep makes a table of many")
-        columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
+        columns = {name: np.asarray(self[name]) for name in self.model.quantities} | {"mode": np.asarray(self.mode)}
         request = self.model.description() | {"status": self.status, "end_time": float(self.end_time)}
         quantities = self.model.quantities | {"mode": Quantity("1", "mode")}
         return run_table(quantities, {"time": np.asarray(self.t)}, columns, ["time"], request)

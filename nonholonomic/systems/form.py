@@ -21,6 +21,7 @@ from ..compilation.xla_cpu import Function, equations_in, traced
 from ..parameters import TreeForm
 from ..text import counted, described, shown
 from ..validation import as_number, is_traced, require, warn
+from . import mechanics
 from .mechanics import AbstractFormulation, AbstractMode, AbstractSystem, Lagrange, State, components_of, exit_of
 
 # A hybrid system: smooth modes with resets between them, as functions of one state.
@@ -40,9 +41,9 @@ class Hybrid(eqx.Module):
 
     **Arguments:**
 
-    - `modes`: the modes, whose states have the same components. A mode can also be an `AbstractSystem` without a
-      Lagrangian of its own: its state is its coordinates, followed by their rates, and its `reset` may return
-      `(q, rate, number)` with the index of the next mode. A run then starts from the state or from a pair (q, rate).
+    - `modes`: the modes, whose states have the same components. A mode can also be an `AbstractSystem`: its state is its
+      coordinates, followed by their rates, and its `reset` may return `(q, rate, number)` with the index of the next mode. A
+      run then starts from the state or from a pair (q, rate).
     - `event`: a function of time [s] and state, `event(t, y)`, or `None`. The event is the first time after the start
       at which the function falls through zero, along the motion or by a reset. An `equinox.Module` can have its own
       parameters.
@@ -323,12 +324,16 @@ def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
         _check_vector(start, "start", None if size is None else 2 * size)
     for number, mode in mechanical.items():
         prefix = "" if mode is system else f"modes[{number}]."
-        if prefix and type(mode).lagrangian is not AbstractSystem.lagrangian:
+        names = [name for name in mechanics.ARGUMENTS if name == "margin" or mechanics.is_own(mode, name)]
+        for name in names:
+            _check_signature(mode, name, prefix)
+        if "frame" in names and mechanics.is_driven(mode):
             raise ValueError(
-                f"{prefix}lagrangian: a system with a Lagrangian of its own cannot be a mode; write metric and potential"
+                f"{prefix}frame: quasi-velocities need constraints without a drift and functions that do not depend on time; "
+                "leave frame out to run with Lagrange multipliers"
             )
         form = Form.of(Hybrid([Lagrange(mode)]), 2 * mode.dimension)[0]
-        _check_functions(form, prefix)
+        _check_functions(form, prefix, tuple(mechanics.written(mode, name) for name in names))
 
 
 def _check_vector(value: Any, name: str, size: int | None) -> None:
@@ -346,33 +351,54 @@ def _check_vector(value: Any, name: str, size: int | None) -> None:
         raise ValueError(f"{name} must be of shape {shape}, not {np.shape(value)}{example}")
 
 
+def _check_signature(system: AbstractSystem, name: str, prefix: str) -> None:
+    """Raise `ValueError` unless a function that may depend on time takes its arguments, the time first."""
+    if name not in mechanics.TIMED:
+        return
+    signature, has_time = inspect.signature(getattr(system, name)), mechanics.takes_time(system, name)
+    arguments = mechanics.ARGUMENTS[name]
+    try:
+        signature.bind(*range(has_time + 1 + arguments.count(",")))
+        is_wrong = "t" in signature.parameters and not has_time
+    except TypeError:
+        is_wrong = True
+    if is_wrong:
+        raise ValueError(
+            f"{prefix}{name}({', '.join(signature.parameters)}) must be {name}({arguments}) or, if it depends on time, "
+            f"{name}(t, {arguments})"
+        )
+
+
 @functools.lru_cache(maxsize=256)
-def _check_functions(form: Form, prefix: str) -> None:
+def _check_functions(form: Form, prefix: str, names: tuple[str, ...]) -> None:
     """Raise `ValueError` that names a function of a system that JAX cannot trace or that returns a wrong shape.
 
     **Arguments:** `form`: that of a `Hybrid` of one formulation, so that a system with other numbers is not traced
-    again; `prefix`: that of the names of the functions.
+    again; `prefix`: that of the names of the functions; `names`: the functions with their arguments.
     """
     n = form.size // 2
     numbers, t, _ = form.arguments
     q = jax.ShapeDtypeStruct((n,), t.dtype)
+    shapes = {}
     functions = {
-        "metric(q)": ((q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
-        "potential(q)": ((q,), "one number", lambda shape: shape == ()),
-        "constraints(q)": (
-            (q,),
+        "metric": (f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
+        "potential": ("one number", lambda shape: shape == ()),
+        "constraints": (
             f"of shape (k, {n}), a row for each constraint, such as jnp.array([[...]]) for one",
             lambda shape: shape is not None and len(shape) == 2 and shape[1] == n,
         ),
-        "frame(q)": ((q,), f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
-        "force(t, q, rate)": ((t, q, q), f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
-        "margin(t, q, rate)": (
-            (t, q, q),
+        "drift": (
+            "of shape (k,), a number for each row of constraints",
+            lambda shape: shape == shapes.get("constraints", (0,))[:1],
+        ),
+        "lagrangian": ("one number", lambda shape: shape == ()),
+        "frame": (f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
+        "force": (f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
+        "margin": (
             "one number, an array of shape (k,), a dict of numbers by name, or None",
             lambda shape: shape is None or (shape != "" and (set(shape) == {()} or len(shape) < 2)),
         ),
-        "reset(t, q, rate)": (
-            (t, q, q),
+        "reset": (
             f"(q, rate), both of shape ({n},), or None; as a mode of a Hybrid also (q, rate, number of the next mode)",
             lambda shape: shape is None or (shape[:2] == ((n,), (n,)) and shape[2:] in ((), ((),))),
         ),
@@ -384,13 +410,16 @@ def _check_functions(form: Form, prefix: str) -> None:
         exit = exit_of(system.margin(*arguments), 0) if method == "reset" else ()
         return getattr(system, method)(*arguments, *exit)
 
-    for name, (arguments, expected_shape, fits) in functions.items():
+    for name in names:
+        method, _, listed = name.removesuffix(")").partition("(")
+        expected_shape, fits = functions[method]
+        arguments = [t if argument == "t" else q for argument in listed.split(", ")]
         words = f"the coordinates q{' and their rates, each' if 'rate' in name else ','} of shape ({n},)"
-        words = (f"the time t, a number, and {words}" if "(t" in name else words) + EXIT * name.startswith("reset")
+        words = (f"the time t, a number, and {words}" if "(t" in name else words) + EXIT * (method == "reset")
         with named_errors(f"{prefix}{name}", words):
-            result = jax.eval_shape(functools.partial(called, name.partition("(")[0]), numbers, *arguments)
-        shape = _shape_of(result)
-        if name.startswith("margin") and result is None:
+            result = jax.eval_shape(functools.partial(called, method), numbers, *arguments)
+        shape = shapes[method] = _shape_of(result)
+        if method == "margin" and result is None:
             break  # Nothing calls the reset.
         if not fits(shape):
             raise ValueError(f"{prefix}{name} must be {expected_shape}, not {shown(result) if shape == '' else shape}")

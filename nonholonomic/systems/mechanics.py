@@ -1,7 +1,7 @@
 """Equations of motion of a constrained mechanical system, derived from its data alone; JAX computes every derivative.
 
-The data of a system are its metric G(q), potential V(q), constraint one-forms W(q) with W q' = 0, frame E(q), and the
-generalised force f(t, q, q') of drives and friction. From them follow
+The data of a system are its metric G(t, q), potential V(t, q), constraint one-forms W(t, q) with W q' = d(t, q), frame E(q),
+and the generalised force f(t, q, q') of drives and friction. From them follow
 
 - `Lagrange`: Lagrange's equations with multipliers, in coordinates and velocities;
 - `Hamel`: Poincare's equations in the quasi-velocities of the frame; with constraints, Hamel's equations.
@@ -13,6 +13,7 @@ At the end of the file are the rules by which a run may start.
 """
 
 import abc
+import inspect
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any, ClassVar
@@ -23,11 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ..compilation.tracing import dependent_outputs
 from ..geometry import solve
 
 # A mode as equations of motion.
 
 State = Float[Array, " components"]
+Number = Float[ArrayLike, ""]
 
 #: What the `margin` of a mode returns, and its `reset`.
 Margin = Float[Array, "..."] | dict[str, Float[Array, ""]] | None
@@ -126,9 +129,14 @@ class AbstractSystem(eqx.Module):
     """A mechanical system with n coordinates and k linear constraints on its velocity.
 
     Subclass it, declare the numbers of your model as fields, set `dimension` to the number of coordinates, and write functions
-    of one set of coordinates: the `metric`, and as needed `potential`, `constraints`, `force` and `frame`. The equations of
-    motion follow; `nonholonomic.simulate`, `event_time`, `sweep` and `identify` run them. For a system that strikes something,
-    write `margin` and `reset` as well.
+    of one set of coordinates: the `metric`, and as needed `potential`, `constraints`, `drift`, `force` and `frame`. The
+    equations of motion follow; `nonholonomic.simulate`, `event_time`, `sweep` and `identify` run them. For a system that
+    strikes something, write `margin` and `reset` as well.
+
+    Where `metric`, `potential`, `constraints`, `drift` or `lagrangian` depends on time, write the time as the first argument
+    and call it `t`, as in `metric(self, t, q)`. Runs of a system with such a function or with a drift also have the quantities
+    `energy` and `support_power`, the power that moving supports put in. With the rates q', the drift d, the multipliers lambda
+    and the Lagrangian L, this power is lambda.d - dL/dt, and the energy changes by it and by the power of the `force`.
 
     **Example:** a bead on a parabolic wire z = x^2 / 2, which oscillates in about 2 pi / sqrt(g).
 
@@ -164,7 +172,7 @@ class AbstractSystem(eqx.Module):
     def freedom(self) -> int:
         """Number n - k of independent velocities."""
         q = jax.ShapeDtypeStruct((self.dimension,), jnp.result_type(float))
-        return self.dimension - jax.eval_shape(self.constraints, q).shape[0]
+        return self.dimension - jax.eval_shape(at_time(self, 0.0).constraints, q).shape[0]
 
     @abc.abstractmethod
     def metric(self, q: Coordinates) -> Float[Array, "n n"]:
@@ -175,24 +183,33 @@ class AbstractSystem(eqx.Module):
         return jnp.zeros((), q.dtype)
 
     def constraints(self, q: Coordinates) -> Float[Array, "k n"]:
-        """One-forms W(q), one per row, that vanish on every allowed velocity; none by default.
+        """One-forms W(q), one per row, whose products with an allowed velocity are the `drift`, by default zero; no rows by
+        default.
 
         Where they depend on a number of the system, the start has to change with it: the derivative by the number alone is
         that of runs that leave the constraints.
         """
         return jnp.zeros((0, q.size), q.dtype)
 
+    def drift(self, q: Coordinates) -> Float[Array, " k"]:
+        """Right-hand side d(q) of the constraints W q' = d, such as the velocity of a turning table under a ball; zero by
+        default. It must be continuous in time.
+
+        Where it depends on a number of the system, the start has to change with it, as for `constraints`.
+        """
+        return jnp.zeros(self.constraints(q).shape[0], q.dtype)
+
     def frame(self, q: Coordinates) -> Float[Array, "n n"]:
-        """Frame fields E(q), one per column; W annihilates the first n - k. By default, the coordinate fields."""
+        """Frame fields E(q), one per column; W annihilates the first n - k. By default, the coordinate fields. A system with
+        a drift or functions of time cannot have another frame.
+        """
         return jnp.eye(q.size, dtype=q.dtype)
 
-    def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+    def force(self, t: Number, q: Coordinates, rate: Coordinates) -> Coordinates:
         """Generalised force f(t, q, q') in addition to that of the potential; zero by default."""
         return jnp.zeros_like(q)
 
-    def margin(
-        self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates
-    ) -> Float[Array, "..."] | dict[str, Float[Array, ""]] | None:
+    def margin(self, t: Number, q: Coordinates, rate: Coordinates) -> Margin:
         """A smooth function that is positive while the system moves freely and falls through zero where it strikes something,
         such as the distance from a wall; several in an array, (k,), or in a dict by name, of which the first to fall counts;
         `None`, the default, for a system that strikes nothing. The function may change faster than the motion, as for
@@ -200,7 +217,7 @@ class AbstractSystem(eqx.Module):
         """
         return None
 
-    def reset(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> tuple[Any, ...] | None:
+    def reset(self, t: Number, q: Coordinates, rate: Coordinates) -> tuple[Any, ...] | None:
         """The coordinates and rates that follow when the margin has fallen to zero, `(q, rate)`, such as those after an
         `impact`; `None`, the default, if the run ends here. If there are several margins, write
         `reset(self, t, q, rate, exit)`: `exit` is the index of the margin that fell, or for a dict a dict that is true for its
@@ -214,18 +231,14 @@ class AbstractSystem(eqx.Module):
         return None
 
     def impact(
-        self,
-        t: Float[ArrayLike, ""],
-        q: Coordinates,
-        rate: Coordinates,
-        restitution: Float[ArrayLike, ""] = 1.0,
-        exit: Any = None,
+        self, t: Number, q: Coordinates, rate: Coordinates, restitution: Number = 1.0, exit: Any = None
     ) -> Coordinates:
         """The rates after an impact without friction on the surface where the margin is zero.
 
         The impulse acts along the gradient of the margin with respect to the coordinates; the constraints act at the same
-        time, so that the rates obey them before and after. The rate of the margin changes its sign and is multiplied by
-        the restitution (Newton's law of impact). With a restitution of 1, the energy is conserved.
+        time, so that the rates obey them before and after. The rate of the margin, which includes the motion of an obstacle
+        if the margin depends on time, changes its sign and is multiplied by the restitution (Newton's law of impact). With a
+        restitution of 1 and obstacles at rest, the energy is conserved.
 
         **Arguments:** `t`, `q`, `rate`: at the impact; `restitution`: usually in [0, 1]; `exit`: as for `reset`, for a system
         with several margins.
@@ -262,33 +275,111 @@ class AbstractSystem(eqx.Module):
         ```
         """
 
-        def margin(q: Coordinates) -> Float[Array, ""]:
+        def margin(q: Coordinates, t: Number = t) -> Float[Array, ""]:
             margin: Any = self.margin(t, q, rate)
             if isinstance(margin, dict):
                 return sum((jnp.where(exit[name], value, 0.0) for name, value in margin.items()), jnp.zeros(()))
             return margin if exit is None else margin[exit]
 
+        now = at_time(self, t)
         gradient = jax.grad(margin)(q)
-        metric = with_constraints(self.metric(q), self.constraints(q))
-        push = within_constraints(self, q, solve(metric, gradient, positive=True))
-        return rate - (1.0 + restitution) * (gradient @ rate) / (gradient @ push) * push
+        metric = with_constraints(now.metric(q), now.constraints(q))
+        push = within_constraints(now, q, solve(metric, gradient, positive=True), is_impulse=True)
+        approach = gradient @ rate
+        if any(dependent_outputs(lambda t: margin(q, t), t)):
+            approach += jax.grad(margin, argnums=1)(q, jnp.asarray(t, float))
+        return rate - (1.0 + restitution) * approach / (gradient @ push) * push
 
     def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
-        """The Lagrangian L(q, q') = q'.G q' / 2 - V."""
+        """The Lagrangian L(q, q') = q'.G q' / 2 - V. One of your own may have terms linear in the rates."""
         return 0.5 * rate @ self.metric(q) @ rate - self.potential(q)
 
     def energy(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
-        """Energy q'.dL/dq' - L; for a Lagrangian quadratic in q', kinetic plus potential energy."""
+        """Energy q'.dL/dq' - L; for a Lagrangian quadratic in q', kinetic plus potential energy. If a function depends on time,
+        read the quantity `energy` of a run.
+        """
         return jax.grad(self.lagrangian, argnums=1)(q, rate) @ rate - self.lagrangian(q, rate)
 
 
-def within_constraints(system: AbstractSystem, q: Coordinates, rate: Coordinates) -> Coordinates:
-    """The rates closest to some rates, in the kinetic metric, that the constraints allow."""
+#: The functions of a system that may have the time as a further first argument, and all its functions, with their arguments.
+TIMED = dict.fromkeys(("metric", "potential", "constraints", "drift"), "q") | {"lagrangian": "q, rate"}
+ARGUMENTS = TIMED | {"frame": "q"} | dict.fromkeys(("force", "margin", "reset"), "t, q, rate")
+
+
+def is_own(system: object, name: str) -> bool:
+    """Whether a system has its own function of this name; a number of this name is none."""
+    method = vars(system).get(name, getattr(type(system), name))
+    return callable(method) and method is not getattr(AbstractSystem, name)
+
+
+def takes_time(system: object, name: str) -> bool:
+    """Whether a method in `TIMED` has the time as its first argument."""
+    return is_own(system, name) and next(iter(inspect.signature(getattr(system, name)).parameters), "") == "t"
+
+
+def written(system: object, name: str) -> str:
+    """A method and its arguments."""
+    return f"{name}({'t, ' * (name in TIMED and takes_time(system, name))}{ARGUMENTS[name]})"
+
+
+def is_driven(system: object) -> bool:
+    """Whether this is a mechanical system with a drift or functions of time, apart from its force."""
+    is_mechanical = isinstance(system, AbstractSystem)
+    return is_mechanical and (is_own(system, "drift") or any(takes_time(system, name) for name in TIMED))
+
+
+class SystemAtTime(AbstractSystem):
+    """A system at one time [s], whose functions are those of the coordinates and rates alone."""
+
+    system: AbstractSystem
+    time: Number
+
+    @property
+    def dimension(self) -> int:
+        return self.system.dimension
+
+    def value(self, name: str, *arguments: Coordinates) -> Array:
+        """The value of a function of the system at the time."""
+        if not is_own(self.system, name):
+            return getattr(super(), name)(*arguments)
+        method = getattr(self.system, name)
+        return method(self.time, *arguments) if takes_time(self.system, name) else method(*arguments)
+
+    def metric(self, q: Coordinates) -> Float[Array, "n n"]:
+        return self.value("metric", q)
+
+    def potential(self, q: Coordinates) -> Float[Array, ""]:
+        return self.value("potential", q)
+
+    def constraints(self, q: Coordinates) -> Float[Array, "k n"]:
+        return self.value("constraints", q)
+
+    def drift(self, q: Coordinates) -> Float[Array, " k"]:
+        return self.value("drift", q)
+
+    def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
+        return self.value("lagrangian", q, rate)
+
+
+def at_time(system: AbstractSystem, t: Number) -> AbstractSystem:
+    """A system whose functions are those of the coordinates and rates alone: the system itself if none depends on time."""
+    return SystemAtTime(system, t) if any(takes_time(system, name) for name in TIMED) else system
+
+
+def within_constraints(
+    system: AbstractSystem, q: Coordinates, rate: Coordinates, is_impulse: bool = False
+) -> Coordinates:
+    """The rates closest to some rates, in the kinetic metric, that the constraints allow.
+
+    **Arguments:** `system`: at a time; `is_impulse`: whether the rates are a change, on which the drift has no effect.
+    """
     W = system.constraints(q)
     if not W.shape[0]:
         return rate
     per_impulse = solve(with_constraints(system.metric(q), W), W.T, positive=True)
-    return rate - per_impulse @ solve(W @ per_impulse, W @ rate, positive=True)
+    has_drift = is_own(system, "drift") and not is_impulse
+    per_multiplier, excess = W @ per_impulse, W @ rate - system.drift(q) if has_drift else W @ rate
+    return rate - per_impulse @ solve(per_multiplier, excess, positive=True)
 
 
 def with_constraints(metric: Float[Array, "n n"], W: Float[Array, "k n"]) -> Float[Array, "n n"]:
@@ -342,24 +433,24 @@ class AbstractFormulation(AbstractMode):
     def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
         """Coordinates and velocity, each (n,), of a state."""
 
-    def acceleration(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+    def acceleration(self, t: Number, q: Coordinates, rate: Coordinates) -> Coordinates:
         """Second derivative of the coordinates, by the chain rule through this formulation's state."""
         state = self.state(q, rate)
         return jax.jvp(self.split, (state,), (self.field(jnp.asarray(t), state),))[1][1]
 
-    def margin(self, t: Float[ArrayLike, ""], y: State) -> Margin:
+    def margin(self, t: Number, y: State) -> Margin:
         return self.system.margin(t, *self.split(y))
 
-    def reset(self, t: Float[ArrayLike, ""], y: State, *exit: Any) -> tuple[Any, ...] | None:
+    def reset(self, t: Number, y: State, *exit: Any) -> tuple[Any, ...] | None:
         """The state after a reset, and the index of the next mode if the system names it."""
         system: Any = self.system
         following = system.reset(t, *self.split(y), *exit)
         return None if following is None else (self.state(*following[:2]), *following[2:])
 
-    def entered(self, t: Float[ArrayLike, ""], y: State) -> State:
+    def entered(self, t: Number, y: State) -> State:
         """The state after a reset to this mode, with rates that obey the constraints."""
         q, rate = self.split(y)
-        return self.state(q, within_constraints(self.system, q, rate))
+        return self.state(q, within_constraints(at_time(self.system, t), q, rate))
 
 
 def components_of(mode: object, y: State) -> State:
@@ -394,7 +485,7 @@ class Hamel(AbstractFormulation):
         q, u = self.quasi_velocity(state)
         return q, self.system.frame(q) @ u
 
-    def field(self, t: Float[ArrayLike, ""], y: State, args=None) -> State:
+    def field(self, t: Number, y: State, args=None) -> State:
         system, free = self.system, self.system.freedom
         q, u = self.quasi_velocity(y)
         E = system.frame(q)
@@ -414,11 +505,12 @@ class Hamel(AbstractFormulation):
 
 
 class Lagrange(AbstractFormulation):
-    """Lagrange's equations with multipliers, G q'' + G' q' = dL/dq + f + W^T lambda, with W q'' + W' q' = 0.
+    """Lagrange's equations with multipliers, G q'' + G' q' = dL/dq + f + W^T lambda, with W q'' + W' q' = d'.
 
+    The primes of G, W and the drift d are derivatives along the motion, which includes the passing of time. With a Lagrangian
+    of its own, a system has the Hessian of L in place of G, and the derivative of dL/dq' at constant rates in place of G' q'.
     The state is (q, q'), so one linear system with the metric is solved for the force and the rows of W together. The metric
-    may be singular if it is positive for the allowed rates, as with parts without mass. The Lagrangian must be kinetic minus
-    potential energy. Source: `stroller.md`, section 6, F1.
+    may be singular if it is positive for the allowed rates, as with parts without mass. Source: `stroller.md`, section 6, F1.
 
     **Arguments:**
 
@@ -438,33 +530,57 @@ class Lagrange(AbstractFormulation):
         q, rate = jnp.split(state, 2)
         return q, rate
 
-    def field(self, t: Float[ArrayLike, ""], y: State, args=None) -> State:
+    def field(self, t: Number, y: State, args=None) -> State:
         q, rate = self.split(y)
         return jnp.concatenate([rate, self.acceleration(t, q, rate)])
 
-    def acceleration(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
-        system = self.system
+    def acceleration(self, t: Number, q: Coordinates, rate: Coordinates) -> Coordinates:
+        system, has_drift, has_lagrangian = self.system, is_own(self.system, "drift"), is_own(self.system, "lagrangian")
 
-        def seen(q: Coordinates) -> tuple[Array, Array]:
-            return system.constraints(q), system.metric(q)
+        def seen(q: Coordinates, t: ArrayLike = t) -> tuple[Array, Array, Array | None]:
+            now = at_time(system, t)
+            W = now.constraints(q)
+            inertia = jax.grad(now.lagrangian, argnums=1)(q, rate) if has_lagrangian else now.metric(q)
+            return W, inertia, now.drift(q) if has_drift else None
 
-        (W, G), (bend, swell) = jax.jvp(seen, (q,), (rate,))
-        free = jax.grad(system.lagrangian)(q, rate) + system.force(t, q, rate) - swell @ rate
-        per_mass = solve(with_constraints(G, W), jnp.column_stack([W.T, free]), positive=True)
+        now = at_time(system, t)
+        times = () if now is system else (jnp.asarray(t, float),)
+        (W, G, _), (bend, swell, pull) = jax.jvp(seen, (q, *times), (rate, *map(jnp.ones_like, times)))
+        free = jax.grad(now.lagrangian)(q, rate) + system.force(t, q, rate)
+        free -= swell if has_lagrangian else swell @ rate
+        G = jax.hessian(now.lagrangian, argnums=1)(q, rate) if has_lagrangian else G
+        # The masses may jump in time without an effect on the motion: as a traced function, they are known for it.
+        mass = with_constraints(G, W) if now is system else jax.jit(with_constraints)(G, W)
+        per_mass = solve(mass, jnp.column_stack([W.T, free]), positive=True)
         by_constraints, unconstrained = per_mass[:, :-1], per_mass[:, -1]
-        multipliers = solve(W @ by_constraints, bend @ rate + W @ unconstrained, positive=True)
-        return unconstrained - by_constraints @ multipliers
+        per_multiplier, excess = W @ by_constraints, bend @ rate + W @ unconstrained
+        excess = excess if pull is None else excess - pull
+        return unconstrained - by_constraints @ solve(per_multiplier, excess, positive=True)
 
 
 def formulation_of(system: AbstractSystem) -> AbstractFormulation:
     """The equations of motion for a mechanical system.
 
     If the system has its own frame, or its own Lagrangian (which may have terms linear in the velocities), the
-    equations are in quasi-velocities, which obey the constraints exactly; otherwise they use Lagrange multipliers.
+    equations are in quasi-velocities, which obey the constraints exactly; otherwise, and with a drift or functions of time,
+    they use Lagrange multipliers.
     """
-    has_frame = type(system).frame is not AbstractSystem.frame
-    has_lagrangian = type(system).lagrangian is not AbstractSystem.lagrangian
-    return Hamel(system) if has_frame or has_lagrangian else Lagrange(system)
+    has_fields = is_own(system, "frame") or is_own(system, "lagrangian")
+    return Hamel(system) if has_fields and not is_driven(system) else Lagrange(system)
+
+
+def energy_and_support_power(
+    system: AbstractSystem, t: Number, q: Coordinates, rate: Coordinates
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The energy E, and the power lambda.d - dL/dt that moving supports put in.
+
+    The power is dE/dt - f.q': from d/dt(dL/dq') = dL/dq + f + W^T lambda and E = q'.dL/dq' - L follows
+    dE/dt = q'.f + lambda.W q' - dL/dt, and the constraints are W q' = d.
+    """
+    acceleration = Lagrange(system).acceleration(t, q, rate)
+    point, direction = (jnp.asarray(t, float), q, rate), (np.ones(()), rate, acceleration)
+    energy, change = jax.jvp(lambda t, q, rate: at_time(system, t).energy(q, rate), point, direction)
+    return energy, change - jnp.sum(system.force(t, q, rate) * rate)
 
 
 # Whether runs of a user's system may start: rules for concrete and traced numbers, and their messages.
@@ -484,12 +600,14 @@ Parts = dict[str, Any]
 
 
 def parts_of_system(system: AbstractSystem, q: Coordinates, rate: Coordinates) -> Parts:
-    """What the rules compare of a mechanical system: its metric, constraints and frame."""
-    has_metric = type(system).lagrangian is AbstractSystem.lagrangian
-    metric = system.metric(q) if has_metric else jax.hessian(system.lagrangian, argnums=1)(q, rate)
-    W = system.constraints(q)
+    """What the rules compare of a mechanical system at time 0: its metric, constraints, drift and frame."""
+    now = at_time(system, 0.0)
+    metric = jax.hessian(now.lagrangian, argnums=1)(q, rate) if is_own(system, "lagrangian") else now.metric(q)
+    W = now.constraints(q)
     parts = {"metric": metric, "constraints": W}
-    if W.shape[0] and system.freedom and isinstance(formulation_of(system), Hamel):
+    if is_own(system, "drift"):
+        parts["drift"] = now.drift(q)
+    elif W.shape[0] and system.freedom and isinstance(formulation_of(system), Hamel):
         parts["frame"] = W @ system.frame(q)[:, : system.freedom]
     return parts
 
@@ -533,7 +651,11 @@ def rooms(parts: Parts, xp: ModuleType) -> Parts:
     if W.shape[-2]:
         rate, greatest = parts["y"][..., n:], _greatest(xp, W, 2)
         left["rank"] = independent - round_off ** (2.0 / 3.0)
-        left["constraints"] = exact * greatest * _greatest(xp, rate, 1) - _greatest(xp, _projected(W, rate), 1)
+        violation = _projected(W, rate)
+        if "drift" in parts:
+            left["finite"] = left["finite"] + 0.0 * xp.sum(parts["drift"], axis=-1)
+            violation = violation - parts["drift"]
+        left["constraints"] = exact * greatest * _greatest(xp, rate, 1) - _greatest(xp, violation, 1)
         if "frame" in parts:
             left["frame"] = exact * greatest - _greatest(xp, parts["frame"], 2)
     left["metric"] = _least_pivot(xp, allowed @ scaled @ allowed + others) - n * round_off
@@ -563,8 +685,8 @@ def _least_pivot(xp: ModuleType, matrix: Array) -> Array:
     return least
 
 
-def problem_of_start(parts: Parts, rule: str, mode: str) -> str:
-    """What is wrong with a start that breaks a rule. **Arguments:** `mode`: prefix of the names of functions."""
+def problem_of_start(parts: Parts, rule: str, named: Callable[[str], str]) -> str:
+    """What is wrong with a start that breaks a rule. **Arguments:** `named`: writes a function with its arguments."""
     if rule == "start":
         return f"start = {parts['y']} must be finite"
     if rule == "margin":
@@ -572,29 +694,29 @@ def problem_of_start(parts: Parts, rule: str, mode: str) -> str:
     W, G = parts["constraints"], parts["metric"]
     n, k = len(G), len(W)
     if rule == "finite":
-        name, value = ("constraints", W) if np.isfinite(G).all() else ("metric", G)
-        return f"{mode}{name}(q) = {value.tolist()} at the start must be finite"
+        name = next(name for name in ("metric", "constraints", "drift") if not np.isfinite(parts[name]).all())
+        return f"{named(name)} = {parts[name].tolist()} at the start must be finite"
     if rule == "symmetry":
-        return f"{mode}metric(q) = {G.tolist()} at the start must be symmetric"
+        return f"{named('metric')} = {G.tolist()} at the start must be symmetric"
     if rule == "constraints":
-        rate = parts["y"][n:]
-        error = np.max(np.abs(W @ rate))
-        return f"start: rate = {rate} violates the constraints by {error:.3g}; constraints(q) @ rate must be 0"
+        rate, right = parts["y"][n:], named("drift") if "drift" in parts else "0"
+        error = np.max(np.abs(W @ rate - parts.get("drift", 0.0)))
+        return f"start: rate = {rate} violates the constraints by {error:.3g}; {named('constraints')} @ rate must be {right}"
     if rule == "frame":
         return (
-            f"{mode}frame(q): the constraints must annihilate its first {n - k} columns, and do so only up to "
+            f"{named('frame')}: the constraints must annihilate its first {n - k} columns, and do so only up to "
             f"{np.max(np.abs(parts['frame'])):.3g}; leave it out to run with Lagrange multipliers"
         )
     lengths = np.linalg.norm(W, axis=1, keepdims=True)
     spanned = np.linalg.svd(W / np.where(lengths > 0.0, lengths, 1.0)) if k else (None, np.zeros(0), np.eye(n))
     if rule == "rank":
         return (
-            f"{mode}constraints(q) has {k} rows of rank {(spanned[1] > VIOLATION).sum()} at the start, and its rows must be "
+            f"{named('constraints')} has {k} rows of rank {(spanned[1] > VIOLATION).sum()} at the start, and its rows must be "
             "independent: leave out those that follow from the others"
         )
     allowed = spanned[2][k:]
     least = np.linalg.eigvalsh(allowed @ G @ allowed.T)[0]
     return (
-        f"{mode}metric(q) must be positive for all rates that the constraints allow, and its least eigenvalue for them is "
+        f"{named('metric')} must be positive for all rates that the constraints allow, and its least eigenvalue for them is "
         f"{least:.4g} at the start: a mass or a moment of inertia may be zero or negative, or the coordinates singular there"
     )

@@ -36,12 +36,15 @@ from .mechanics import AbstractSystem, Lagrange, components_of, formulation_of, 
 
 # A user's own system as a model: its numbers by name, its modes, and its components.
 
+#: The further quantities of a mechanical system with a drift or functions of time, and their descriptions.
+BALANCE = {"energy": "energy", "support_power": "power of moving supports"}
+
 
 class OwnModel(AbstractModel):
     """A `Hybrid` or an `AbstractSystem`, its start and its event, which is a part of `parameters`.
 
     `form`: the form of the hybrid system; `names`: those of the components of a state; `draw`: as for
-    `Trajectory.view`.
+    `Trajectory.view`; `has_balance`: whether the quantities include those of `BALANCE`.
     """
 
     parameters: Parameters
@@ -49,6 +52,7 @@ class OwnModel(AbstractModel):
     names: tuple[str, ...] = eqx.field(static=True)
     event: None = None
     draw: Draw = eqx.field(static=True, default=None)
+    has_balance: bool = eqx.field(static=True, default=False)
 
     @classmethod
     def of(cls, tree: dict[str, Any], draw: Draw = None) -> "OwnModel":
@@ -56,7 +60,9 @@ class OwnModel(AbstractModel):
         hybrid, state = assembled(tree)
         form = Form.of(hybrid, state.size)[0]
         form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
-        return cls(parameters=Parameters.of(tree), form=form, names=names_of(tree["system"], form.size), draw=draw)
+        system = tree["system"]
+        named = {"names": names_of(system, form.size), "has_balance": mechanics.is_driven(system)}
+        return cls(parameters=Parameters.of(tree), form=form, draw=draw, **named)
 
     def __reduce__(self) -> tuple[Function, tuple[dict[str, Any], Draw]]:
         # The structure of a tree with a user's classes cannot be pickled, but the tree can.
@@ -102,11 +108,14 @@ class OwnModel(AbstractModel):
             return
         parts = jax.tree.map(np.asarray, _compiled_parts(self))
         left = mechanics.rooms(parts, np)
-        system = self.parameters.tree["system"]
+        system, prefix = self.parameters.tree["system"], ""
+        if isinstance(system, Hybrid):
+            system, prefix = system.modes[system.first], f"modes[{system.first}]."
         for rule in mechanics.RULES:
             if rule in left and not left[rule] >= 0.0:
-                mode = f"modes[{system.first}]." if isinstance(system, Hybrid) else ""
-                raise ValueError(mechanics.problem_of_start(parts, rule, mode))
+                raise ValueError(
+                    mechanics.problem_of_start(parts, rule, lambda name: prefix + mechanics.written(system, name))
+                )
 
     def require_values(self, values: dict[str, ArrayLike]) -> None:
         for module, kind in checks_of(self.replaced(values).parameters.tree):
@@ -208,12 +217,22 @@ class OwnModel(AbstractModel):
     @property
     def quantities(self) -> dict[str, Quantity]:
         reads = [lambda run, k=k: run.state[..., k] for k in range(len(self.names))]
-        return {name: Quantity("1", name, read=read) for name, read in zip(self.names, reads, strict=True)}
+        quantities = {name: Quantity("1", name, read=read) for name, read in zip(self.names, reads, strict=True)}
+        for k, (name, text) in enumerate(BALANCE.items() if self.has_balance else ()):
+            quantities[name] = Quantity(
+                "1", text, read=lambda run, k=k: _compiled_balance(run.model, run.t, run.state)[k]
+            )
+        return quantities
 
     def read(
         self, names: tuple[str, ...], time: Array, rows: Float[Array, "rows *cells"], mode: object
     ) -> dict[str, Array]:
-        return {name: part for name, part in zip(self.names, self.components_of(rows), strict=True) if name in names}
+        parts = dict(zip(self.names, self.components_of(rows), strict=True))
+        if not BALANCE.keys().isdisjoint(names) and self.has_balance:
+            times = jnp.broadcast_to(rows[-1] if self.form.traits.depends_on_time else jnp.nan, rows.shape[1:])
+            states = jnp.moveaxis(rows[: self.form.size], 0, -1)
+            parts |= dict(zip(BALANCE, _balance_of(self, times, states), strict=True))
+        return {name: part for name, part in parts.items() if name in names}
 
     def components_of(self, rows: Float[Array, "rows *cells"]) -> Float[Array, "components *cells"]:
         """States of the engine in the user's components."""
@@ -258,6 +277,26 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array]:
     return Hybrid([formulation], event), formulation.state(start["q"], start["rate"])
 
 
+def _balance_of(
+    model: OwnModel, times: Float[Array, "*cells"], states: Float[Array, "*cells components"]
+) -> tuple[Float[Array, "*cells"], Float[Array, "*cells"]]:
+    """The quantities of `BALANCE` at some states. **Arguments:** `model`: with numbers that have the first axes of the times,
+    or none."""
+
+    def of_one(t: Array, state: Array, *numbers: Array) -> tuple[Array, Array]:
+        return mechanics.energy_and_support_power(
+            model.parameters.form.tree(numbers)["system"], t, *jnp.split(state, 2)
+        )
+
+    values, function = model.parameters.values, of_one
+    for level in reversed(range(times.ndim)):
+        function = jax.vmap(function, (0, 0, *(0 if jnp.ndim(value) > level else None for value in values)))
+    return function(times, states, *values)
+
+
+_compiled_balance = eqx.filter_jit(_balance_of)
+
+
 def _all_left(left: mechanics.Parts) -> Any:
     """Whether no rule of a start is broken."""
     return functools.reduce(operator.and_, (room >= 0.0 for room in left.values()))
@@ -276,6 +315,8 @@ def _parts_of_cells(model: OwnModel) -> mechanics.Parts:
         parts = parts_of_system(first, *arguments) if isinstance(first, AbstractSystem) else {}
         margins = jax.tree.leaves(first.margin(jnp.zeros((), y.dtype), *arguments))
         least = {"margin": functools.reduce(jnp.minimum, map(jnp.min, margins))} if margins else {}
+        if isinstance(system, Hybrid):
+            parts.pop("frame", None)  # Modes of a `Hybrid` use Lagrange multipliers.
         return {"y": y} | parts | least
 
     values = jax.lax.stop_gradient(model.parameters.values)
@@ -341,15 +382,15 @@ def names_of(system: Hybrid | AbstractSystem, size: int) -> tuple[str, ...]:
     size = owner.dimension if has_rates else size
     if (names := owner.names) is None:
         return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(size))
-    words = ()
+    words, taken = (), TAKEN.union(BALANCE if mechanics.is_driven(system) else ())
     if isinstance(names, tuple | list) and all(isinstance(name, str) and name.isidentifier() for name in names):
         words = (*names, *(f"{name}_rate" for name in names if has_rates))
-        if len(names) == size and len(set(words)) == len(words) and set(words).isdisjoint(TAKEN):
+        if len(names) == size and len(set(words)) == len(words) and taken.isdisjoint(words):
             return words
     kind = "coordinate" if has_rates else "component of the state"
     raise ValueError(
         f"{type(owner).__name__}.names = {shown(names)} must be {size} different words, one for each {kind}, and none that "
-        f"names anything else in a run or a table, such as {', '.join(sorted(TAKEN.intersection(words))) or 'time'}"
+        f"names anything else in a run or a table, such as {', '.join(sorted(taken.intersection(words))) or 'time'}"
     )
 
 

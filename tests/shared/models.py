@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import pytest
-from own_modes import Ball, Bumper, Sleigh
+from own_modes import Ball, Bumper, Sleigh, Turntable
 from tops import rutstam_top
 
 import stroller
@@ -99,7 +99,14 @@ IMPACTS = {
     )
 }
 
-CASES |= OF_MODES | IMPACTS
+#: A mechanical system whose constraints have a drift.
+SUPPORTS = {
+    "turntable": Case(
+        Turntable(drag=0.3), Turntable().start(0.3, 0.1, 0.2, -0.1), 2.0, lambda t, y: 0.45 - y[0], "drag", 0.3, "x"
+    )
+}
+
+CASES |= OF_MODES | IMPACTS | SUPPORTS
 
 #: The cases of the ordinary run: others have tests of their own, or take long to compile.
 ORDINARY = ("top", "modes", "mechanics")

@@ -135,6 +135,38 @@ def after_impact(sleigh, heading, speed, time):
     return jnp.stack([heading + turn, top * jnp.sqrt(turning / m) * jnp.tanh(later), top / jnp.cosh(later)])
 
 
+class Turntable(AbstractSystem):
+    """A ball that rolls without slipping on a table that turns at a rate about the origin; q[2] and q[3] are its rotations
+    about the axes of the plane."""
+
+    turn: float = 1.3
+    mass: float = 2.0
+    radius: float = 0.1
+    drag: float = 0.0
+    dimension = 4
+
+    names = ("x", "y", "about_x", "about_y")
+
+    def metric(self, q):
+        inertia = 0.4 * self.mass * self.radius**2
+        return jnp.diag(jnp.array([self.mass, self.mass, inertia, inertia]))
+
+    def constraints(self, q):
+        return jnp.array([[1.0, 0.0, 0.0, -self.radius], [0.0, 1.0, self.radius, 0.0]])
+
+    def drift(self, q):
+        return self.turn * jnp.array([-q[1], q[0]])
+
+    def force(self, t, q, rate):
+        return -self.drag * jnp.array([rate[0], rate[1], 0.0, 0.0])
+
+    def start(self, x, y, x_rate, y_rate):
+        """Coordinates and rates of a ball that rolls."""
+        about_x, about_y = self.turn * x - y_rate, x_rate + self.turn * y
+        rate = jnp.array([x_rate, y_rate, about_x / self.radius, about_y / self.radius])
+        return jnp.array([x, y, 0.0, 0.0]), rate
+
+
 class Pendulum(AbstractSystem):
     """A mass on a rod, by its angle."""
 

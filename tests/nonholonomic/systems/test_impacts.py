@@ -181,9 +181,9 @@ WRONG = {
         r"modes\[1\]\.reset\(t, q, rate\) cannot be traced by JAX",
     ),
     "systems of two sizes": (lambda: Hybrid([Sleigh(), TableBall()]), r"one number of coordinates, not 2, 3"),
-    "a Lagrangian of one's own": (
-        lambda: Hybrid([broken(Sleigh, lagrangian=lambda self, q, rate: rate @ rate)]),
-        r"modes\[0\]\.lagrangian: a system with a Lagrangian of its own cannot be a mode",
+    "a Lagrangian that is a vector": (
+        lambda: Hybrid([broken(Sleigh, lagrangian=lambda self, q, rate: rate)]),
+        r"modes\[0\]\.lagrangian\(q, rate\) must be one number, not \(3,\)",
     ),
 }
 
