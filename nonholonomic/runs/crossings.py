@@ -37,16 +37,21 @@ from .table import TableForm
 #: with the margin of the mode.
 SAME = 1e-9
 
+#: A crossing within this fraction of the time after another one is the same: without a time between them, a function cannot
+#: rise and fall again, and a run that only changes its mode does not go on.
+AT_ONCE = 1e-12
+
 
 class Kept(NamedTuple):
     """What is kept of the crossings of every cell: the number so far, whether the last one is at the end of a mode whose reset
-    comes next, whether the last mode ended on the section or beyond, the number of resets since the last crossing, and of
-    those that are asked for the times [s], the states and the modes, with the cells last."""
+    comes next, whether the last mode ended on the section or beyond, the number of resets since the last crossing, the time of
+    that [s], and of those that are asked for the times [s], the states and the modes, with the cells last."""
 
     counted: Int[Array, " cells"]
     at_end: Bool[Array, " cells"]
     beyond: Bool[Array, " cells"]
     resets: Int[Array, " cells"]
+    last: Float[Array, " cells"]
     time: Float[Array, "count cells"]
     state: Float[Array, "components count cells"]
     mode: Int[Array, "count cells"]
@@ -137,7 +142,7 @@ def crossings_in_cells(
         never, none = jnp.full((count, size), jnp.nan), jnp.zeros((count, size), int)
         state = jnp.full((components, count, size), jnp.nan)
         zeros, false = jnp.zeros(size, int), jnp.zeros(size, bool)
-        return Kept(zeros, false, false, zeros, never, state, none)
+        return Kept(zeros, false, false, zeros, jnp.full(size, -jnp.inf), never, state, none)
 
     def with_row(kept: Kept, is_new: Array, is_shown: Array, time: Array, state: Array, mode: Any) -> Kept:
         counted, cell = kept.counted + is_new, jnp.arange(size)
@@ -170,6 +175,7 @@ def crossings_in_cells(
             value, slope, error = near_zero(problem, jnp.zeros(size), problem.start()[0])
             is_on = kept.beyond & (jnp.abs(value) <= error) & (slope < 0.0)
             leaves = jnp.where(is_on, -2.0 * error / jnp.where(is_on, slope, 1.0), -jnp.inf)
+            leaves = greatest(leaves, kept.last + AT_ONCE * runs.end_time - runs.end_time)
             scheduler = LaneScheduler.of(problem, left, jnp.asarray(size), settings, nonterminal=True, one_kernel=True)
             outcome, _, new = scheduler.solve(CrossingRecorder(skip, count, runs.end_time, leaves, numbers[0]), kept)
             if after:
@@ -180,8 +186,9 @@ def crossings_in_cells(
                 outcome = outcome._replace(status=status, end_time=outcome.end_time + shift, state=moved)
             value, _, error = near_zero(problem, outcome.end_time, outcome.state)
             at_end = crossed_at_end(outcome) & (outcome.crossing_time > leaves) & (outcome.status == LEFT_DOMAIN)
-            resets = jnp.where(new.counted > kept.counted, 0, kept.resets)
-            new = new._replace(at_end=at_end, beyond=value <= error, resets=resets)
+            crosses, time = new.counted > kept.counted, runs.end_time + outcome.crossing_time
+            resets, last = jnp.where(crosses, 0, kept.resets), jnp.where(crosses, time, kept.last)
+            new = new._replace(at_end=at_end, beyond=value <= error, resets=resets, last=last)
             advanced = (after_solve(runs, outcome, horizon), new)
             return jax.tree.map(functools.partial(jnp.where, active), advanced, carry)
 
@@ -190,11 +197,15 @@ def crossings_in_cells(
             left = greatest(horizon[cell] - runs.end_time[cell], 0.0)
             transition = of_cells(modes[numbers[0]], cell).reset_map(runs.state[:, cell], left)
             new = after_reset(runs, transition, horizon)
-            crosses = lost & (jnp.isfinite(transition.crossing_time) | kept.at_end) & (new.status != FAILED)
+            is_new = (
+                jnp.isfinite(transition.crossing_time) & (runs.end_time > kept.last * (1.0 + AT_ONCE)) & ~kept.at_end
+            )
+            crosses = lost & (is_new | kept.at_end) & (new.status != FAILED)
             is_new = crosses & ~kept.at_end
             shown = new if after else runs
             kept = with_row(kept, is_new, crosses if after else is_new, shown.end_time, shown.state, shown.mode)
-            kept = kept._replace(at_end=kept.at_end & ~lost, resets=jnp.where(is_new, 0, kept.resets + lost))
+            resets, last = jnp.where(is_new, 0, kept.resets + lost), jnp.where(is_new, runs.end_time, kept.last)
+            kept = kept._replace(at_end=kept.at_end & ~lost, resets=resets, last=last)
             is_last = kept.counted >= skip + count
             status = jnp.where(is_last, CROSSED, jnp.where(kept.resets >= MOST_ROUNDS, UNRESOLVED, new.status))
             new = new._replace(status=jnp.where(new.status == RUNNING, status, new.status))

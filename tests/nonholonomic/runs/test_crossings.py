@@ -123,6 +123,31 @@ def test_no_crossing_at_a_reset_into_a_mode_that_does_not_exist():
         assert np.isnan(event_time(ball, [1.0, 0.0, 0.0], 9.0))
 
 
+class Stuck(AbstractMode):
+    """Two of these lead to each other at height zero, and neither moves on from there."""
+
+    following: int
+
+    def field(self, t, y):
+        return -jnp.ones(1)
+
+    def margin(self, t, y):
+        return y[0]
+
+    def reset(self, t, y):
+        return y, self.following
+
+
+@pytest.mark.parametrize("side", ["before", "after"])
+def test_resets_that_repeat_at_one_instant_are_one_crossing(side):
+    """A run that is stuck there does not return, however many of its modes end."""
+    options = {"side": side, "progress": False}
+    table = crossings(Hybrid([Stuck(1), Stuck(0)]), [0.5], 4.0, ground, count=2, **options)
+    assert table.status == "unresolved"
+    assert table.time[0] == pytest.approx(0.5)
+    assert np.isnan(table.time[1])
+
+
 def test_crossings_between_resets_in_a_table():
     """The start at the apex does not count."""
     restitution = [0.5, 0.8]
