@@ -25,6 +25,7 @@ TUTORIALS = {
     "own_oscillator": ("run", ".portrait('y0', 'y1')"),
     "own_sleigh": ("run", ".portrait('q0', 'q1')"),
     "video": ("fit", ".plot()"),
+    "walker": ("diagram", ".plot('y0')"),
 }
 
 #: Script that draws the scene of a page at a given time.

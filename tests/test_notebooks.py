@@ -72,7 +72,7 @@ def show(source: str, names: dict[str, Any]) -> None:
 
 #: The longest pages; tests of planning, bodies, fits, flights, laws, surfaces and own systems exercise their functions.
 LONG = ("planning", "rattleback", "trust", "hops", "friction", "surface", "egg")
-LONG += ("own_oscillator", "own_sleigh", "own_systems", "classroom")
+LONG += ("own_oscillator", "own_sleigh", "own_systems", "classroom", "walker")
 
 
 @pytest.mark.parametrize(
