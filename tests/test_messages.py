@@ -141,6 +141,10 @@ REFUSED = {
         lambda: tippe.inversion_time(TOP, LAUNCH, 1.0, 171.0),
         "did you mean np.radians(171.0)?",
     ),
+    "a list of launches in a table": (
+        lambda: tippe.inversion_table(TOP, [LAUNCH, LAUNCH], t1=1.0),
+        "launch must be one Launch, not a list of 2; scattered=True takes lists of their numbers, by name",
+    ),
     "a launch of three thetas and two spins": (
         lambda: tippe.Launch([0.1, 0.2, 0.3], [100.0, 150.0]),
         "Launch: theta of shape (3,), spin of shape (2,): the numbers of one object must be scalars or lists of equal length; "

@@ -441,8 +441,7 @@ def bifurcation(
     words = np.ravel(table.status).tolist()
     early = [word for word in words if word not in (Status.EVENT.word, Status.COMPLETED.word, Status.ILLEGAL.word)]
     if early:
-        kinds = ", ".join(dict.fromkeys(early))
-        warn(f"{len(early)} of {len(words)} runs ended early ({kinds}): the diagram lacks their last returns")
+        warn(f"{len(early)} of {len(words)} runs ended early ({', '.join(dict.fromkeys(early))}): returns are missing")
     return table
 
 

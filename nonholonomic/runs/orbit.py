@@ -295,7 +295,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
     def components(self, leaves: Sequence[Array], rows: Float[Array, "rows cells"], mapped: bool = True) -> Array:
         """States of the engine in the components of a start, (components, cells), by default mapped by the symmetry."""
         model: Any = self.model(leaves)
-        parts = model.read(model.names, jnp.asarray(jnp.nan), rows, None)
+        # Runs keep by how much they violate constraints, so that orbits that violate them would be a family with others.
+        parts = model.read(model.names, jnp.asarray(jnp.nan), model.on_constraints(rows), None)
         state = jnp.stack([parts[name] for name in model.names])
         if not (self.has_symmetry and mapped):
             return state

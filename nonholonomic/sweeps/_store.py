@@ -62,7 +62,7 @@ def table_path(path: object) -> Path:
     """
     file = as_path(path, "path")
     if file.suffix.lower() in OTHER_FORMATS:
-        advice = "for a CSV or Excel file, use to_dataframe().to_csv or .to_excel"
+        advice = "for a CSV or Excel file, use to_dataframe().to_csv or .to_excel, or to_dataframe(unit='deg')"
         raise ValueError(f"path = {str(path)!r} must end in .h5: the file is in HDF5; {advice}")
     return file
 

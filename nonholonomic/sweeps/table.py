@@ -81,10 +81,9 @@ class Table(eqx.Module):
         if not isinstance(name, str):
             names = ", ".join(self)
             raise ValueError(f"table[{name!r}]: {name!r} must be the name of a variable or an axis: {names}")
-        for names in (self.variables, self.coords):
-            if name in names:
-                return names[name]
-        raise KeyError(f"the table has no {name!r}; it has {', '.join(self)}")
+        if name not in list(self):
+            raise KeyError(f"the table has no {name!r}; it has {', '.join(self)}")
+        return (self.variables if name in self.variables else self.coords)[name]
 
     def __iter__(self) -> Iterator[str]:
         """The names of the variables, and then of the coordinates."""
@@ -157,14 +156,17 @@ class Table(eqx.Module):
         dataset = xarray.Dataset(variables, coords, self.attributes)
         return dataset if chunks is None else dataset.chunk(chunks)
 
-    def to_dataframe(self) -> "pandas.DataFrame":
+    def to_dataframe(self, unit: str | Sequence[str] | None = None) -> "pandas.DataFrame":
         """The table as a `pandas.DataFrame` (needs pandas): one row per cell, one column per axis and variable.
 
         If variables have additional dimensions, such as "time", there is a row for each point along these dimensions,
         and the other variables are repeated. Each component of a vector is a column, such as "position.x".
         `attrs["units"]` contains the units.
 
-        **Raises:** `ModuleNotFoundError`, with the command that installs it, if pandas is missing.
+        **Arguments:** `unit`: as for `plot`, such as ("deg", "rpm"); by default SI units.
+
+        **Raises:** `ModuleNotFoundError`, with the command that installs it, if pandas is missing; `ValueError` for an unknown
+        unit.
 
         **Example:**
 
@@ -182,6 +184,9 @@ class Table(eqx.Module):
         require_package("pandas", "pandas", "to_dataframe")
         import pandas
 
+        require_unit(unit)
+        if unit:
+            return self.drawn_in(unit, *self.variables).to_dataframe()
         inner = dict.fromkeys(dim for dims in self.inner.values() for dim in dims)
         component_dims = {dim for dim in inner if np.asarray(self.coords[dim]).dtype.kind == "U"}
         dims = [*axes_of(self.coords, self.inner), *(dim for dim in inner if dim not in component_dims)]
@@ -547,13 +552,15 @@ class Tabular(Viewable, abc.ABC):
         file = table_path(path)
         self.to_table().save(file)
 
-    def to_dataframe(self) -> "pandas.DataFrame":
+    def to_dataframe(self, unit: str | Sequence[str] | None = None) -> "pandas.DataFrame":
         """The run as a `pandas.DataFrame` (needs pandas): a row for each time, a column for each quantity or component.
 
-        **Raises:** `ValueError` for a batch of runs.
+        **Arguments:** `unit`: as for `plot`, such as ("deg", "rpm"); by default SI units.
+
+        **Raises:** `ValueError` for a batch of runs, and for an unknown unit.
         """
         require_package("pandas", "pandas", "to_dataframe")
-        return self.to_table().to_dataframe()
+        return self.to_table().to_dataframe(unit)
 
     def table_of(self, names: Sequence[str]) -> Table:
         """A table over the run's times with at least the named quantities, or with all if one of the names is unknown."""

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -200,19 +200,18 @@ class OwnModel(AbstractModel):
         return OwnModel.of(tree | {"system": system, "event": None})
 
     def direction(self, cells: int, number: int = 0) -> Float[Array, "components cells"]:
-        changes, form = super().direction(cells, number), self.form
+        states = self.modes(cells, ROUND_OFF, self.comparable, False)[2]
+        return jax.jvp(self.on_constraints, (states,), (super().direction(cells, number),))[1]
+
+    def on_constraints(self, states: Float[Array, "rows cells"]) -> Float[Array, "rows cells"]:
+        """States of the engine in the first mode, with rates that obey its constraints."""
+        form = self.form
         if not form.traits.projected[form.first]:
-            return changes
-        entered = form.function("entered", form.first)
-
-        def of_one(numbers: Sequence[Array], state: Array, change: Array) -> Array:
-            t, y = time_and_state(form, tuple(state))
-            _, allowed = jax.jvp(lambda y: entered(numbers, t, y), (y,), (change[: form.size],))
-            return jnp.concatenate([allowed, change[form.size :]])
-
-        (numbers, _), states = self._runs(cells), self.modes(cells, ROUND_OFF, self.comparable, False)[2]
+            return states
+        entered, numbers = form.function("entered", form.first), self._runs(states.shape[1])[0]
         axes = tuple(0 if jnp.ndim(number) else None for number in numbers)
-        return jax.vmap(of_one, in_axes=(axes, 1, 1), out_axes=1)(numbers, states, changes)
+        of_one = jax.vmap(lambda numbers, state: entered(numbers, *time_and_state(form, tuple(state))), (axes, 1), 1)
+        return jnp.concatenate([of_one(numbers, states), states[form.size :]])
 
     @property
     def quantities(self) -> dict[str, Quantity]:

@@ -165,6 +165,13 @@ def test_a_run_goes_to_pandas(run):
     frame = run.to_dataframe()
     assert_close(frame["position.x"], run.position[:, 0])
     assert frame.attrs["units"]["theta"] == "rad"
+    in_degrees = run.to_dataframe(unit=("deg", "rpm"))
+    assert_close(in_degrees["theta"], np.degrees(run.theta), rtol=1e-12)
+    assert_close(in_degrees["spin"], np.asarray(run.spin) * 30.0 / np.pi, rtol=1e-12)
+    assert_close(in_degrees["position.x"], frame["position.x"])
+    assert (in_degrees.attrs["units"]["theta"], in_degrees.attrs["units"]["spin"]) == ("deg", "rpm")
+    with pytest.raises(ValueError, match="unit = 'degree celsius' must be one of"):
+        run.to_dataframe(unit="degree celsius")
     with pytest.raises(
         AttributeError, match=re.escape("no 'to_datafrme'; did you mean 'to_dataframe'? It has t, theta")
     ):

@@ -207,7 +207,7 @@ def launches(
             raise ValueError(f"{name} = None is not a number: pass a launch, or both theta and spin")
     stated, launch_values = launch_values.get("launch"), {k: v for k, v in launch_values.items() if k != "launch"}
     if stated is not None:
-        require_kind(stated, "launch", Launch)
+        require_kind(stated, "launch", Launch, several="scattered=True takes lists of their numbers, by name")
         if any(np.any(value) for name, value in launch_values.items() if name != "mu"):
             raise ValueError("launch must be left out where its numbers are given")
         own = {name for name in launch_values if f"launch.{name}" not in axes}

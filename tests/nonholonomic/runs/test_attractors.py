@@ -141,7 +141,7 @@ def test_a_diagram_says_how_many_runs_ended_early(monkeypatch):
         attractors, "crossings", lambda *_, **__: Table({"rate": np.arange(6.0)}, {"status": status}, {}, {})
     )
     with pytest.warns(
-        UserWarning, match=r"3 of 6 runs ended early \(unresolved, failed\): the diagram lacks their"
+        UserWarning, match=r"3 of 6 runs ended early \(unresolved, failed\): returns are missing"
     ) as caught:
         nonholonomic.bifurcation(None, None, 1.0, axes={"rate": [1.0]})
     assert len(caught) == 1

@@ -8,7 +8,7 @@ from own_modes import GRAVITY, Pendulum
 from scipy.special import ellipk
 
 import tippe
-from nonholonomic import AbstractMode, Hybrid, periodic_orbit
+from nonholonomic import AbstractMode, AbstractSystem, Hybrid, periodic_orbit
 
 
 class Kicked(AbstractMode):
@@ -254,6 +254,39 @@ def test_an_orbit_up_to_a_symmetry():
     np.testing.assert_allclose(orbit.state, [0.0, 3.0], atol=1e-11)
     np.testing.assert_allclose(orbit.period, 2.0 * np.pi / 3.0, rtol=1e-11)
     np.testing.assert_allclose(orbit.multipliers, [np.exp(-0.2 * 2.0 * np.pi / 3.0)], rtol=1e-9)
+
+
+class Blade(AbstractSystem):
+    """A blade that is pushed ahead against drag, and turned to and fro: place, heading and their rates."""
+
+    push: float = 3.0
+    drag: float = 2.0
+    dimension = 3
+
+    def metric(self, q):
+        return jnp.diag(jnp.array([1.0, 1.0, 0.5]))
+
+    def constraints(self, q):
+        return jnp.array([[-jnp.sin(q[2]), jnp.cos(q[2]), 0.0]])
+
+    def force(self, t, q, rate):
+        c, s = jnp.cos(q[2]), jnp.sin(q[2])
+        ahead = self.push - self.drag * (c * rate[0] + s * rate[1])
+        return jnp.array([c * ahead, s * ahead, jnp.sin(t) - self.drag * rate[2]])
+
+
+def test_an_orbit_obeys_its_constraints():
+    """Runs keep by how much they violate them, up to the turn: an orbit aside of them was found, with a multiplier of 1."""
+
+    def seen_from_the_blade(y):
+        c, s = jnp.cos(y[2]), jnp.sin(y[2])
+        return jnp.array([0.0, 0.0, 0.0, c * y[3] + s * y[4], c * y[4] - s * y[3], y[5]])
+
+    guess = ([0.0, 0.0, 0.0], [1.0, 0.0, 0.1])
+    orbit = periodic_orbit(Blade(), guess, period=2.0 * np.pi, symmetry=seen_from_the_blade)
+    np.testing.assert_allclose(orbit.state, [0.0, 0.0, 0.0, 1.5, 0.0, (1.0 / (2.0 + 0.5j)).imag], atol=1e-9)
+    np.testing.assert_allclose(np.abs(orbit.multipliers[:2]), np.exp([-4.0 * np.pi, -8.0 * np.pi]), atol=1e-9)
+    assert int(orbit.family) == 0
 
 
 def test_numbers_inside_a_symmetry():
