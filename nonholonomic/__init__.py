@@ -37,6 +37,7 @@ from .runs.attractors import bifurcation as bifurcation
 from .runs.attractors import lyapunov_exponent as lyapunov_exponent
 from .runs.attractors import lyapunov_spectrum as lyapunov_spectrum
 from .runs.branch import Branch as Branch
+from .runs.branch import Orbit as Orbit
 from .runs.branch import SpecialPoint as SpecialPoint
 from .runs.crossings import crossings as crossings
 from .runs.event import event_time as event_time
@@ -44,7 +45,6 @@ from .runs.identify import EventTimes as EventTimes
 from .runs.identify import Recording as Recording
 from .runs.identify import identify as identify
 from .runs.identify import log_density as log_density
-from .runs.orbit import Orbit as Orbit
 from .runs.orbit import periodic_orbit as periodic_orbit
 from .runs.simulate import simulate as simulate
 from .runs.sweep import sweep as sweep

@@ -208,3 +208,8 @@ ad.primitive_jvps[_departure] = lambda primals, tangents: jax.jvp(
 )
 ad.primitive_transposes[_departure] = _taken_back
 batching.defbroadcasting(_departure)
+
+
+def nearest_turn(angle: Float[Array, "..."], other: Float[Array, "..."]) -> Float[Array, "..."]:
+    """An angle [rad] plus the whole turns that bring it nearest to another one."""
+    return angle + 2.0 * jnp.pi * jnp.round((other - angle) / (2.0 * jnp.pi))

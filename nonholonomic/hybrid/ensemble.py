@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.cache import padded
 from ..compilation.xla_cpu import compiled_quickly, greatest
-from ..integration import AbstractProblem, Lanes, Outcome, Settings, States, follow, solve_ensemble
+from ..integration import AbstractProblem, CoreProblem, Lanes, Outcome, Settings, States, follow, solve_ensemble
 from ..integration.dense import PIECE_OF_MODE
 from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..integration.scheduler import NO_EXTREMES, Numbers, of_cells
@@ -115,6 +115,28 @@ class AbstractBatchedMode(eqx.Module):
     def between(self, motion: PyTree, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
         """The output rows of one stretch in `Transition.record`, at times [s] counted from its start."""
         raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
+
+
+class StartedProblem(CoreProblem):
+    """The leading components of a problem, which may be all, from other states."""
+
+    states: States
+
+    def start(self) -> tuple[States, States]:
+        return self.states, super().start()[1]
+
+
+class OnlyMode(AbstractBatchedMode):
+    """The only mode of a smooth motion: a run ends where the motion leaves its domain."""
+
+    motion: AbstractProblem
+
+    def problem(self, state: States) -> StartedProblem:
+        return StartedProblem(self.motion, len(state), state)
+
+    def reset_map(self, state: States, left: Lanes) -> Transition:
+        none = jnp.zeros(state.shape[1:], int)
+        return Transition(none, state, none + 0.0, none + LEFT_DOMAIN, none + jnp.inf, none[None])
 
 
 class AbstractHoppingMode(AbstractBatchedMode):

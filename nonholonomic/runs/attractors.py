@@ -288,14 +288,9 @@ INDEPENDENT = 1e-9
 
 def independent_directions(model: AbstractModel) -> tuple[Float[Array, "directions components 1"], bool]:
     """Independent generic changes of the start of one run, as many as there are; and whether other changes are impossible."""
-    first = model.direction(1)
-    if model.smooth:
-        magnitudes = model.problem(1, model.comparable).start()[1]
-    else:
-        modes, number, states = modes_of(model, 1, 1e-9, model.comparable)
-        magnitudes = modes[int(np.asarray(number)[0])].problem(states).start()[1]
-    count = len(first)
-    changes = jnp.stack([first, *(model.direction(1, number) for number in range(1, count))])
+    modes, number, states = modes_of(model, 1, 1e-9, model.comparable)
+    magnitudes = modes[int(np.asarray(number)[0])].problem(states).start()[1]
+    changes = jnp.stack([model.direction(1, number) for number in range(len(states))])
     lengths, _ = orthonormalised(changes / magnitudes)
     is_new = np.exp(np.asarray(lengths)[:, 0]) > INDEPENDENT
     return changes[is_new], bool(is_new.sum() < np.sum(np.asarray(magnitudes) < UNMEASURED))

@@ -1,6 +1,8 @@
-"""Branches of periodic orbits over a number, with their special points (`runs/continuation.py` follows them)."""
+"""Periodic orbits as `runs/orbit.py` finds them, and their branches over a number, with special points
+(`runs/continuation.py` follows them)."""
 
 import itertools
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -8,26 +10,179 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Int
 
-from ..compilation.tracing import named_errors
+from ..compilation.tracing import dependent_outputs, named_errors
 from ..parameters import meant, of_all_modes, short_names
 from ..sweeps import Table
 from ..sweeps.grid import attributes_of
 from ..terminal import status_line
 from ..text import counted, shown
-from ..validation import require, require_outside, require_package, require_whole
+from ..validation import is_traced, require, require_outside, require_package, require_whole
 from ..views.plot import new_figure
-from .continuation import ASIDE, CROSSING, DIVERGES, DOUBLING, ENDS, OF_A_FAMILY, REGULAR, STEPS, Continuation, Point
+from .continuation import (
+    ASIDE,
+    CROSSING,
+    DIVERGES,
+    DOUBLING,
+    ENDS,
+    OF_A_FAMILY,
+    RANK,
+    REGULAR,
+    STEPS,
+    Continuation,
+    Point,
+)
 
-# Only for type checkers: xarray is optional, and an orbit knows how to branch.
+# Only for type checkers: xarray is optional.
 if TYPE_CHECKING:
     import xarray
 
-    from .orbit import Orbit
-
 #: A relative difference of periods that counts as none; states below this are no scale for the unknowns.
 SAME_PERIOD, SMALLEST_SCALE = 1e-9, 1e-9
+
+#: Multipliers nearer to the unit circle than this count as on it.
+ON_CIRCLE = 1e-9
+
+#: Why there is no orbit, by `Orbit.reason`.
+REASONS = (
+    "",
+    "the run from there ends, or does not cross the section again within t1 = {t1:.6g} s{at_rest}",
+    "the return from there ends in another mode than the first",
+    "a return from there still misses it by {residual:.2g}{hint}",
+    "the state is an equilibrium{at_rest}",
+    "the run from there ends before the period",
+    "the integration of the run from there fails",
+    "a reset of the run from there is grazing, and the return map has no derivative",
+    "a reset falls on the end of the period; shift the phase of the drive",
+    "a number is illegal",
+)
+
+
+class Orbit(eqx.Module):
+    """A periodic orbit, as `periodic_orbit` returns it.
+
+    - `period` [s]; `state`: the state on the section, just after the reset if the section is at a reset.
+    - `multipliers`: the eigenvalues of the derivative of the return map, the largest first; for a section without that of the
+      direction along the motion.
+    - `error`: bound of the errors of the components of the state.
+    - `family`: number of directions in which neighbouring orbits lie, because a quantity is conserved or the motion can be
+      shifted; the orbit is then one of a family near the guess.
+    - `iterations`: number of Newton steps; `residual`: by how much the last return missed; `reason`: 0, or why there is no
+      orbit, as an integer; the other numbers are then NaN or have no meaning.
+    - `names`: those of the components; `leaves`, `search`: the numbers and the form of the search, for `branch`; `returns`:
+      number of returns in a period.
+
+    **Example:** as for `periodic_orbit`.
+
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> none = jnp.array(0)
+    >>> numbers = (jnp.array(2.0), jnp.array([1.0]), jnp.array([0.5 + 0.0j]), jnp.array(1e-12), jnp.array(1e-13))
+    >>> print(nonholonomic.Orbit(*numbers, none, none + 3, none, ("y0",)))
+    stable periodic orbit with a period of 2 s
+      y0 = 1
+      multipliers 0.5
+      error below 1e-12, Newton steps 3
+    """
+
+    period: Float[Array, "..."]
+    state: Float[Array, "... components"]
+    multipliers: Complex[Array, "... multipliers"]
+    error: Float[Array, "..."]
+    residual: Float[Array, "..."]
+    family: Int[Array, "..."]
+    iterations: Int[Array, "..."]
+    reason: Int[Array, "..."]
+    names: tuple[str, ...] = eqx.field(static=True)
+    leaves: tuple[Array, ...] = ()
+    search: Any = eqx.field(static=True, default=None)
+    returns: int = eqx.field(static=True, default=1)
+
+    @property
+    def stable(self) -> Bool[Array, "..."]:
+        """Whether all multipliers lie inside the unit circle, apart from those of a family, which are 1: at most two
+        for each direction. A pair on the circle, as of a conservative system, counts as not stable."""
+        distances = jnp.abs(self.multipliers - 1.0)
+        nearest = jnp.argsort(jnp.argsort(distances, axis=-1), axis=-1)
+        # Round-off splits a double multiplier by the square root of its error.
+        is_own = (nearest < 2 * jnp.asarray(self.family)[..., None]) & (distances < math.sqrt(RANK))
+        return jnp.all(is_own | (jnp.abs(self.multipliers) < 1.0 - ON_CIRCLE), axis=-1)
+
+    @property
+    def status(self) -> str:
+        """How the search has ended: "completed", or "unresolved" or "illegal" without an orbit."""
+        if np.ndim(self.reason):
+            raise ValueError("status is that of a single orbit; the orbits of a batch have `reason`, an array")
+        reason = int(self.reason)
+        return "illegal" if reason == len(REASONS) - 1 else "unresolved" if reason else "completed"
+
+    def branch(
+        self, name: str, until: float, step: float | None = None, points: int = 500, period: Any = None
+    ) -> "Branch":
+        """Follow the orbit while a number changes, by pseudo-arclength continuation; runs on the host.
+
+        The branch goes around folds, where the number turns back. Folds, period doublings, Neimark-Sacker points and branch
+        points are located to 1e-8 of the number. The branch ends at `until`, back at the first value of the number, or where
+        the orbit ceases to exist, such as where a reset grazes. One program is compiled for all points.
+
+        **Arguments:**
+
+        - `name`: the number, of the system or of its event, such as "mu" or "modes[0].mu"; a number of this name in all modes
+          changes in all of them.
+        - `until`: the last value of the number, on either side of the value at the orbit.
+        - `step`: largest change of the number between neighbouring points, by default a fiftieth of the range. Where the
+          state changes faster than the number, in units of its largest component, steps are shorter.
+        - `points`: the most points.
+        - `period`: if the number changes the period of a drive, the period [s] as a function of the number.
+
+        **Returns:** a `Branch`.
+
+        **Raises:** `ValueError` for an unknown number, arguments out of range, an orbit of a batch, and an orbit of a family;
+        pass `free` to `periodic_orbit`, so that the orbit is the only one for a fixed number. The same inside transformations.
+
+        **Example:** the limit cycle of van der Pol's oscillator up to mu = 2.
+
+        ```
+        >>> import jax.numpy as jnp
+        >>> import nonholonomic
+        >>> class Oscillator(nonholonomic.AbstractMode):
+        ...     mu: float
+        ...
+        ...     def field(self, t, y):
+        ...         return jnp.array([y[1], self.mu * (1.0 - y[0] ** 2) * y[1] - y[0]])
+        >>> def section(t, y):
+        ...     return y[1]
+        >>> orbit = nonholonomic.periodic_orbit(nonholonomic.Hybrid([Oscillator(1.0)]), [2.0, 0.0], section)
+        >>> branch = orbit.branch("mu", 2.0, step=0.25)
+        >>> print(f"{branch.periods[0]:.8f} s, {branch.periods[-1]:.8f} s")
+        6.66328686 s, 7.62987448 s
+        >>> print(branch)
+        branch of periodic orbits over mu, 7 points from 1 to 2
+          stable from 1 to 2
+          ended because the number reaches the end of the range
+
+        ```
+        """
+        return branch_of(self, name, until, step, points, period)
+
+    def __repr__(self) -> str:
+        if is_traced(self) or np.ndim(self.period):
+            return f"Orbit(period={shown(self.period)}, state={shown(self.state)})"
+        values = np.asarray(self.multipliers).tolist()
+        multipliers = [f"{value.real:.8g}" + f"{value.imag:+.8g}j" * bool(value.imag) for value in values]
+        pairs = zip(self.names, np.asarray(self.state).tolist(), strict=True)
+        in_returns = f" in {self.returns} returns" if self.returns > 1 else ""
+        stability = "stable" if self.stable else "unstable"
+        lines = [
+            f"{stability} periodic orbit with a period of {float(self.period):.12g} s{in_returns}",
+            ", ".join(f"{name} = {value:.12g}" for name, value in pairs),
+            f"multipliers {', '.join(multipliers)}",
+            f"error below {float(self.error):.1g}, Newton steps {int(self.iterations)}",
+        ]
+        if int(self.family):
+            lines.append(f"one of a family of orbits, in {int(self.family)} direction(s)")
+        return "\n  ".join(lines)
 
 
 class SpecialPoint(NamedTuple):
@@ -46,7 +201,7 @@ class SpecialPoint(NamedTuple):
 
     kind: str
     value: float
-    orbit: "Orbit"
+    orbit: Orbit
 
 
 class Branch(eqx.Module):
@@ -103,7 +258,7 @@ class Branch(eqx.Module):
         """Whether each orbit is stable."""
         return self.orbits.stable
 
-    def orbit(self, k: int) -> "Orbit":
+    def orbit(self, k: int) -> Orbit:
         """The orbit at a point, counted from 0; negative numbers count from the end."""
         return jax.tree.map(lambda part: part[k], self.orbits)
 
@@ -114,7 +269,7 @@ class Branch(eqx.Module):
         return [SpecialPoint(self.kinds[k], float(self.values[k]), self.orbit(k)) for k in places]
 
     @status_line("looking for a branch")
-    def switched(self, k: int | None = None) -> "Orbit":
+    def switched(self, k: int | None = None) -> Orbit:
         """An orbit of the other branch through a special point: of twice the period at a period doubling.
 
         **Arguments:** `k`: which of `special`, a period doubling or a branch point; by default the first of these.
@@ -256,24 +411,27 @@ def continuation_of(
         raise ValueError(OF_A_FAMILY)
     require(until, "until")
     search, model = orbit.search, orbit.search.model(orbit.leaves)
-    parameters = model.parameters
-    known = [full for full in parameters.known if not full.startswith("start")]
+    known = [full for full in (*model.known, *model.known_of_event) if not full.startswith(("start", "launch"))]
     matches = meant(name, known)
     merged = {of_all_modes(match) for match in matches}
     # A number of all modes need not be named as such.
-    full = merged.pop() if len(matches) > 1 and len(merged) == 1 else parameters.full_name("name", name)
+    full = merged.pop() if len(matches) > 1 and len(merged) == 1 else model.full_name("name", name)
     if full not in known:
         raise ValueError(
             f"name = {name!r} is a part of the start; pass a number of the system or of the event: {', '.join(known)}"
         )
-    pairs = zip(parameters.names, parameters.values, strict=True)
-    floats = [own for own, value in pairs if eqx.is_inexact_array(value)]
-    others = tuple(k for k, own in enumerate(floats, 1) if full in (own, of_all_modes(own)))
+
+    def numbers(value: Array) -> list[Array]:
+        return jax.tree.leaves(eqx.filter(model.replaced({full: value}), eqx.is_inexact_array))
+
+    depends = dependent_outputs(numbers, jnp.zeros(()))
+    if len(depends) != len(jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))):
+        raise ValueError(f"name = {name!r} is left out in the scene, or 0; give it a value other than 0 there")
+    others = tuple(k for k, is_number in enumerate(depends, 1) if is_number)
     values = {float(orbit.leaves[k]) for k in others}
     if len(values) > 1:
-        raise ValueError(
-            f"name = {name!r} has different values in the modes; name one of them, such as {floats[others[0] - 1]!r}"
-        )
+        single = next(own for own in known if own != full and of_all_modes(own) == full)
+        raise ValueError(f"name = {name!r} has different values in the modes; name one of them, such as {single!r}")
     first = values.pop()
     if float(until) == first:
         raise ValueError(

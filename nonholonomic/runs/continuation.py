@@ -19,7 +19,7 @@ from ..compilation.xla_cpu import compiled_for_one
 from ..integration.problem import TIGHTEST
 
 if TYPE_CHECKING:
-    from .orbit import Orbit
+    from .branch import Orbit
 
 #: Kinds of special points, in the order of the first entries of `Point.tests`.
 KINDS = FOLD, DOUBLING, TORUS, CROSSING = "fold", "period doubling", "Neimark-Sacker", "branch point"

@@ -283,6 +283,13 @@ def section_of(event: Any, direction: str, side: str) -> Callable[..., Any] | No
     return Rise(event) if direction == "rise" else event
 
 
+def require_section(model: AbstractModel, event: object) -> None:
+    """Raise `ValueError` unless the model has a section."""
+    require_event(model)
+    if isinstance(model, AbstractSceneModel) and event is None:
+        raise ValueError("event = None: the section of a scene needs event=, a function of time and motion")
+
+
 @explaining
 def crossings(
     system: object,
@@ -351,10 +358,7 @@ def crossings(
     for name, number, least in (("count", count, 1), ("skip", skip, 0)):
         require_whole(number, name, least)
     model = model_of(system, start, section_of(event, direction, side), input, jumps)
-    is_scene = isinstance(model, AbstractSceneModel)
-    if is_scene and event is None:
-        raise ValueError("event = None: the section of a scene needs event=, a function of time and motion")
-    require_event(model)
+    require_section(model, event)
     check_horizon(t1, tolerance)
     names = model.names if quantities is None else quantities
     require_names(model.quantities, names)

@@ -90,8 +90,6 @@ def rows_of(model: AbstractModel, names: Names) -> jax.ShapeDtypeStruct:
     """The type of the rows of one state, as `AbstractModel.read` receives them."""
 
     def start() -> Array:
-        if model.smooth:
-            return model.problem(None, names).start()[0]
         modes, _, states = model.modes(1, jnp.asarray(1e-9), names, False)
         return modes[0].shown(states)[:, 0]
 

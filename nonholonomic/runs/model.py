@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..hybrid import AbstractBatchedMode, HybridOutcome
+from ..hybrid.ensemble import OnlyMode
 from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
 from ..parameters import full_name, numbers, with_numbers
@@ -59,6 +60,9 @@ class AbstractModel(eqx.Module):
 
     #: The full names of the parameters; those of the start begin with "start" or "launch".
     known: ClassVar[list[str]]
+
+    #: Those of the event, if they are not among these.
+    known_of_event: ClassVar[list[str]] = []
 
     @abc.abstractmethod
     def full_name(self, argument: str, name: str) -> str:
@@ -138,9 +142,10 @@ class AbstractModel(eqx.Module):
         """The motion of a smooth model, with the event of the model itself unless it has another."""
 
     def modes(self, cells: int, tolerance: Number, names: Names, continues: bool) -> Start:
-        """The modes of a model that is not smooth, and the start in them; `continues`: whether a run continues through
-        its event."""
-        raise NotImplementedError(f"{type(self).__name__} is smooth and has no modes")
+        """The modes of a model, and the start in them; `continues`: whether a run continues through its event. A smooth
+        model has one mode."""
+        motion = self.problem(cells, names)
+        return (OnlyMode(motion),), jnp.zeros(cells, int), motion.start()[0]
 
     @abc.abstractmethod
     def without_event(self) -> "AbstractModel":
@@ -153,14 +158,35 @@ class AbstractModel(eqx.Module):
 
         def states(*moving: Array) -> Array:
             moved = self.replaced(dict(zip(names, moving, strict=True)))
-            if self.smooth:
-                return moved.problem(cells, self.comparable).start()[0]
             return moved.modes(cells, jnp.asarray(1e-9), self.comparable, False)[2]
 
         point = tuple(jnp.asarray(self.value(name), float) for name in names)
         sizes = [jnp.maximum(jnp.abs(value), 1.0) for value in point]
         rates = tuple(jnp.cos(1.0 + k + number * (1.0 + k) ** 2) * size for k, size in enumerate(sizes))
         return jax.jvp(states, point, rates)[1]
+
+    # Periodic motions: the reduced state, which does not tell apart motions that a symmetry of the system shifts.
+
+    #: Where motions are found whose reduced state is at rest, as the end of a message.
+    at_rest: ClassVar[str] = ""
+
+    #: A user's symmetry of the reduced state, as `Parameters`; or `None`.
+    symmetry: Any = eqx.field(default=None, kw_only=True)
+
+    #: Whether the motion or the event depends on time.
+    depends_on_time: ClassVar[bool]
+
+    #: The names of the components of the reduced state, and the numbers of the start that are these, in the order of leaves.
+    reduced_names: ClassVar[tuple[str, ...]]
+    reduced_start: ClassVar[list[Array]]
+
+    @abc.abstractmethod
+    def reduced(self, rows: Float[Array, "rows cells"], mode: Int[Array, " cells"]) -> Float[Array, "components cells"]:
+        """The reduced states of runs, from the states of their modes."""
+
+    def normalised(self) -> Self:
+        """The model with a start that has all numbers of the reduced state; raises `ValueError` for a system without one."""
+        return self
 
     # What a state means.
 
@@ -210,6 +236,10 @@ class AbstractSceneModel(AbstractModel):
     def known_of_event(self) -> list[str]:
         """The full names of the parameters of the event."""
         return [] if self.event is None else self.event.parameters.known
+
+    @property
+    def depends_on_time(self) -> bool:
+        return self.event is not None and self.event.depends_on_time
 
     def full_name(self, argument: str, name: str) -> str:
         return full_name(argument, name, [*self.known, *self.known_of_event])

@@ -1,4 +1,4 @@
-"""Periodic orbits of own systems: fixed points of the return map, by Newton's method with its exact Jacobian.
+"""Periodic orbits: fixed points of the return map, by Newton's method with its exact Jacobian.
 
 The return map leads from a state to the state at the next crossing of a section, or after a given period. Its derivatives pass
 through the resets (`hybrid/saltation.py`). Newton's method goes on at a hundredth of the tolerance in its last step, which
@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..compilation.tracing import named_errors, with_own_numbers
 from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, tangent_scale, tangents_by
@@ -23,14 +23,15 @@ from ..hybrid import solve_hybrid
 from ..hybrid.saltation import VariationalMode, along, delay, variational_modes, variational_start
 from ..integration import Settings
 from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESOLVED
+from ..parameters import Parameters, as_one
 from ..terminal import status_line
 from ..text import described, shown
 from ..validation import as_number, explaining, is_traced, require_outside
-from .branch import Branch, branch_of
+from .branch import REASONS, Orbit
 from .continuation import FINER, NEAR, RANK
-from .crossings import SAME, on_margin, section_of
-from .event import Ensemble, EventTime
-from .model import AbstractModel, AbstractSceneModel, check_run, model_of, require_event, settings_for_lanes
+from .crossings import SAME, on_margin, require_section, section_of
+from .event import Ensemble, EventTime, modes_of
+from .model import AbstractModel, check_run, model_of, settings_for_lanes
 
 #: The most Newton steps; the residual at which they have converged, in units of the tolerance.
 MOST_NEWTON, CONVERGED = 30, 30.0
@@ -46,150 +47,6 @@ SAME_ORBIT = 1e-6
 
 #: The number of parts of an orbit.
 PARTS = 9
-
-
-#: Multipliers nearer to the unit circle than this count as on it.
-ON_CIRCLE = 1e-9
-
-#: Why there is no orbit, by `Orbit.reason`.
-REASONS = (
-    "",
-    "the run from there ends, or does not cross the section again within t1 = {t1:.6g} s",
-    "the return from there ends in another mode than the first",
-    "a return from there still misses it by {residual:.2g}{hint}",
-    "the state is an equilibrium",
-    "the run from there ends before the period",
-    "the integration of the run from there fails",
-    "a reset of the run from there is grazing, and the return map has no derivative",
-    "a reset falls on the end of the period; shift the phase of the drive",
-    "a number is illegal",
-)
-
-
-class Orbit(eqx.Module):
-    """A periodic orbit, as `periodic_orbit` returns it.
-
-    - `period` [s]; `state`: the state on the section, just after the reset if the section is at a reset.
-    - `multipliers`: the eigenvalues of the derivative of the return map, the largest first; for a section without that of the
-      direction along the motion.
-    - `error`: bound of the errors of the components of the state.
-    - `family`: number of directions in which neighbouring orbits lie, because a quantity is conserved or the motion can be
-      shifted; the orbit is then one of a family near the guess.
-    - `iterations`: number of Newton steps; `residual`: by how much the last return missed; `reason`: 0, or why there is no
-      orbit, as an integer; the other numbers are then NaN or have no meaning.
-    - `names`: those of the components; `leaves`, `search`: the numbers and the form of the search, for `branch`; `returns`:
-      number of returns in a period.
-
-    **Example:** as for `periodic_orbit`.
-
-    >>> import jax.numpy as jnp
-    >>> import nonholonomic
-    >>> none = jnp.array(0)
-    >>> numbers = (jnp.array(2.0), jnp.array([1.0]), jnp.array([0.5 + 0.0j]), jnp.array(1e-12), jnp.array(1e-13))
-    >>> print(nonholonomic.Orbit(*numbers, none, none + 3, none, ("y0",)))
-    stable periodic orbit with a period of 2 s
-      y0 = 1
-      multipliers 0.5
-      error below 1e-12, Newton steps 3
-    """
-
-    period: Float[Array, "..."]
-    state: Float[Array, "... components"]
-    multipliers: Complex[Array, "... multipliers"]
-    error: Float[Array, "..."]
-    residual: Float[Array, "..."]
-    family: Int[Array, "..."]
-    iterations: Int[Array, "..."]
-    reason: Int[Array, "..."]
-    names: tuple[str, ...] = eqx.field(static=True)
-    leaves: tuple[Array, ...] = ()
-    search: Any = eqx.field(static=True, default=None)
-    returns: int = eqx.field(static=True, default=1)
-
-    @property
-    def stable(self) -> Bool[Array, "..."]:
-        """Whether all multipliers lie inside the unit circle, apart from those of a family, which are 1: at most two
-        for each direction. A pair on the circle, as of a conservative system, counts as not stable."""
-        distances = jnp.abs(self.multipliers - 1.0)
-        nearest = jnp.argsort(jnp.argsort(distances, axis=-1), axis=-1)
-        # Round-off splits a double multiplier by the square root of its error.
-        is_own = (nearest < 2 * jnp.asarray(self.family)[..., None]) & (distances < math.sqrt(RANK))
-        return jnp.all(is_own | (jnp.abs(self.multipliers) < 1.0 - ON_CIRCLE), axis=-1)
-
-    @property
-    def status(self) -> str:
-        """How the search has ended: "completed", or "unresolved" or "illegal" without an orbit."""
-        if np.ndim(self.reason):
-            raise ValueError("status is that of a single orbit; the orbits of a batch have `reason`, an array")
-        reason = int(self.reason)
-        return "illegal" if reason == len(REASONS) - 1 else "unresolved" if reason else "completed"
-
-    def branch(
-        self, name: str, until: float, step: float | None = None, points: int = 500, period: Any = None
-    ) -> Branch:
-        """Follow the orbit while a number changes, by pseudo-arclength continuation; runs on the host.
-
-        The branch goes around folds, where the number turns back. Folds, period doublings, Neimark-Sacker points and branch
-        points are located to 1e-8 of the number. The branch ends at `until`, back at the first value of the number, or where
-        the orbit ceases to exist, such as where a reset grazes. One program is compiled for all points.
-
-        **Arguments:**
-
-        - `name`: the number, of the system or of its event, such as "mu" or "modes[0].mu"; a number of this name in all modes
-          changes in all of them.
-        - `until`: the last value of the number, on either side of the value at the orbit.
-        - `step`: largest change of the number between neighbouring points, by default a fiftieth of the range. Where the
-          state changes faster than the number, in units of its largest component, steps are shorter.
-        - `points`: the most points.
-        - `period`: if the number changes the period of a drive, the period [s] as a function of the number.
-
-        **Returns:** a `Branch`.
-
-        **Raises:** `ValueError` for an unknown number, arguments out of range, an orbit of a batch, and an orbit of a family;
-        pass `free` to `periodic_orbit`, so that the orbit is the only one for a fixed number. The same inside transformations.
-
-        **Example:** the limit cycle of van der Pol's oscillator up to mu = 2.
-
-        ```
-        >>> import jax.numpy as jnp
-        >>> import nonholonomic
-        >>> class Oscillator(nonholonomic.AbstractMode):
-        ...     mu: float
-        ...
-        ...     def field(self, t, y):
-        ...         return jnp.array([y[1], self.mu * (1.0 - y[0] ** 2) * y[1] - y[0]])
-        >>> def section(t, y):
-        ...     return y[1]
-        >>> orbit = nonholonomic.periodic_orbit(nonholonomic.Hybrid([Oscillator(1.0)]), [2.0, 0.0], section)
-        >>> branch = orbit.branch("mu", 2.0, step=0.25)
-        >>> print(f"{branch.periods[0]:.8f} s, {branch.periods[-1]:.8f} s")
-        6.66328686 s, 7.62987448 s
-        >>> print(branch)
-        branch of periodic orbits over mu, 7 points from 1 to 2
-          stable from 1 to 2
-          ended because the number reaches the end of the range
-
-        ```
-        """
-        return branch_of(self, name, until, step, points, period)
-
-    def __repr__(self) -> str:
-        if is_traced(self) or np.ndim(self.period):
-            return f"Orbit(period={shown(self.period)}, state={shown(self.state)})"
-        values = np.asarray(self.multipliers).tolist()
-        multipliers = [f"{value.real:.8g}" + f"{value.imag:+.8g}j" * bool(value.imag) for value in values]
-        pairs = zip(self.names, np.asarray(self.state).tolist(), strict=True)
-        in_returns = f" in {self.returns} returns" if self.returns > 1 else ""
-        stability = "stable" if self.stable else "unstable"
-        lines = [
-            f"{stability} periodic orbit with a period of {float(self.period):.12g} s{in_returns}",
-            ", ".join(f"{name} = {value:.12g}" for name, value in pairs),
-            f"multipliers {', '.join(multipliers)}",
-            f"error below {float(self.error):.1g}, Newton steps {int(self.iterations)}",
-        ]
-        if int(self.family):
-            lines.append(f"one of a family of orbits, in {int(self.family)} direction(s)")
-        return "\n  ".join(lines)
 
 
 class Return(NamedTuple):
@@ -242,8 +99,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
 
     - `movable`: number of movable leaves; `event`: the times of the section.
     - `starts`: the leaves that are components of the start.
-    - `is_driven`: whether the period is given; `free`: the components that may change; `has_symmetry`: whether the
-      parameters of the model contain a symmetry.
+    - `is_driven`: whether the period is given; `free`: the components that may change.
     - `with_multipliers`: whether the derivatives of the multipliers are computed.
     """
 
@@ -252,16 +108,14 @@ class OrbitSolve(AbstractDifferentiableSolve):
     starts: tuple[int, ...] = eqx.field(static=True)
     is_driven: bool = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
-    has_symmetry: bool = eqx.field(static=True)
     with_multipliers: bool = eqx.field(static=True, default=True)
 
     @classmethod
     def of(cls, model: Any, t1: Array, settings: Settings, *options: Any) -> tuple[Any, ...]:
         """The solve and its leaves. **Arguments:** `options`: the fields from `is_driven` on."""
         event, *numbers, t1, tolerance = EventTime.of(model, t1, settings, False)
-        pairs = zip(model.parameters.names, model.parameters.values, strict=True)
-        names = [name for name, value in pairs if eqx.is_inexact_array(value)]
-        starts = tuple(k for k, name in enumerate(names, 1) if name.startswith("start"))
+        of_start = {id(number) for number in model.reduced_start}
+        starts = tuple(k for k, number in enumerate(numbers, 1) if id(number) in of_start)
         return (cls(1 + event.movable, event, starts, *options), t1, *numbers, tolerance)
 
     def __reduce__(self) -> tuple[type[None], tuple[()]]:
@@ -292,15 +146,13 @@ class OrbitSolve(AbstractDifferentiableSolve):
             moved[k] = component
         return tuple(moved)
 
-    def components(self, leaves: Sequence[Array], rows: Float[Array, "rows cells"], mapped: bool = True) -> Array:
+    def components(self, leaves: Sequence[Array], rows: Array, mode: Array, mapped: bool = True) -> Array:
         """States of the engine in the components of a start, (components, cells), by default mapped by the symmetry."""
-        model: Any = self.model(leaves)
-        # Runs keep by how much they violate constraints, so that orbits that violate them would be a family with others.
-        parts = model.read(model.names, jnp.asarray(jnp.nan), model.on_constraints(rows), None)
-        state = jnp.stack([parts[name] for name in model.names])
-        if not (self.has_symmetry and mapped):
+        model = self.model(leaves)
+        state = model.reduced(rows, mode)
+        if model.symmetry is None or not mapped:
             return state
-        form, values = model.parameters.form, model.parameters.values
+        form, values = model.symmetry.form, model.symmetry.values
         axes = tuple(0 if jnp.ndim(value) else None for value in values)
         return jax.vmap(lambda state, *values: form.tree(values)["symmetry"](state), (-1, *axes), -1)(state, *values)
 
@@ -335,13 +187,14 @@ class OrbitSolve(AbstractDifferentiableSolve):
 
         def build(leaves: tuple[Array, ...], cells: int | None) -> Ensemble:
             assert cells is not None
-            return Ensemble(None, *self.model(leaves).modes(cells, tolerance, (), False), 1, False)
+            model = self.model(leaves)
+            return Ensemble(None, *modes_of(model, cells, tolerance, model.comparable), 1, False)
 
         ensemble, tangents, gather = tangents_by(build, active, leaves, cells)
         pairs = tuple((tangent.modes, tangent.states) for tangent in tangents)
         modes = variational_modes(ensemble.modes, pairs, tolerance, not self.is_driven)
         start, size = variational_start(ensemble.states, pairs), len(ensemble.states)
-        options = {"counters": 2, "n_blocks": 1 + len(pairs), "traced": True}
+        options = {"counters": 1 + max(1, len(self.model(leaves).counters)), "n_blocks": 1 + len(pairs), "traced": True}
         ended = solve_hybrid(modes, ensemble.first, start, left, cells, settings, **options)
         rows = jnp.reshape(ended.state, (1 + len(pairs), size + 1, cells))
         # A run that has ended at a reset which jumps over the zero is in no mode.
@@ -356,7 +209,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
             in_mode = jnp.where(primal[-1] > 0.0, primal[-1], ended.end_time)
             at_reset = is_here & on_margin(problem, in_mode, moved)
             at_edge |= at_reset | (is_here & (primal[-1] <= SAME * ended.end_time))
-            if own_mode.margins and not self.is_driven:
+            if getattr(own_mode, "margins", 0) and not self.is_driven:
                 through, *by = (dataclasses.replace(part, continues=True) for part in (own_mode, *of_mode.tangents))
                 continued = dataclasses.replace(of_mode, mode=through, tangents=tuple(by))
                 transition = continued.reset_map(ended.state.at[:size].set(moved), jnp.full(cells, jnp.inf))
@@ -369,7 +222,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
             slopes = jnp.where(is_here, jnp.concatenate([changes, delays[:, None]], axis=1), slopes)
         slopes = jnp.where(ended.counts[-1] > 0, jnp.nan, slopes)
         gathered = gather([(slope[-1], jnp.moveaxis(slope[:size], -1, 0)) for slope in slopes])
-        point, changes, rate = self._in_components(leaves, active, point, [by[1].T for by in gathered], rate)
+        changes = [by[1].T for by in gathered]
+        point, changes, rate = self._in_components(leaves, active, [point, mode], changes, rate)
         count, delays = len(self.starts), [by[0] for by in gathered]
         wanted, missing = (REACHED_END, 5) if self.is_driven else (CROSSED, 1)
         has_failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
@@ -378,22 +232,24 @@ class OrbitSolve(AbstractDifferentiableSolve):
         by_state, time_by_state = (jnp.stack(parts[:count], axis=-1) for parts in (changes, delays))
         time = ended.end_time if self.is_driven else ended.crossing_time
         by_numbers = (changes[count:], delays[count:])
-        return Return(time, point, rate, by_state, time_by_state, *by_numbers, in_motion, reason, ended.counts[0])
+        resets = jnp.sum(ended.counts[:-1], axis=0)
+        return Return(time, point, rate, by_state, time_by_state, *by_numbers, in_motion, reason, resets)
 
     def _in_components(
-        self, leaves: tuple[Array, ...], active: tuple[int, ...], point: Array, changes: list[Array], rate: Array
+        self, leaves: tuple[Array, ...], active: tuple[int, ...], ended: list[Array], changes: list[Array], rate: Array
     ) -> tuple[Array, list[Array], Array]:
-        """The state of a return in components, its derivative by each active leaf, (cells, components), and its rate."""
+        """The state of a return in components, its derivative by each active leaf, (cells, components), and its rate.
+        **Arguments:** `ended`: the state and the mode of the engine."""
 
         def read(point: Array, *moving: Array) -> Array:
             values = list(leaves)
             for k, leaf in zip(active, moving, strict=True):
                 values[k] = leaf
-            return self.components(values, point)
+            return self.components(values, point, ended[1])
 
-        moving = [jnp.broadcast_to(leaves[k], point.shape[1:]) for k in active]
+        moving = [jnp.broadcast_to(leaves[k], rate.shape[1:]) for k in active]
         still = [jnp.zeros_like(leaf) for leaf in moving]
-        state, push = jax.linearize(read, point, *moving)
+        state, push = jax.linearize(read, ended[0], *moving)
         units = [[*still[:k], jnp.ones_like(leaf), *still[k + 1 :]] for k, leaf in enumerate(moving)]
         slopes = [push(change, *unit).T for change, unit in zip(changes, units, strict=True)]
         return state, slopes, push(rate, *still)
@@ -403,10 +259,11 @@ class OrbitSolve(AbstractDifferentiableSolve):
         Where the function rises, the states stay."""
         total, falls = jnp.zeros(cells), jnp.zeros(cells, bool)
         # With a component that is not free, a start must be on the section.
-        has_section = not (self.is_driven or self.has_symmetry) and len(self.free) == len(self.starts)
+        model = self.model(leaves)
+        has_section = not self.is_driven and model.symmetry is None and len(self.free) == len(self.starts)
         for _ in range(3 * has_section):
             moved = self.with_start(leaves, state)
-            modes, first, states = self.model(moved).modes(cells, jnp.min(leaves[-1]), (), False)
+            modes, first, states = modes_of(self.model(moved), cells, jnp.min(leaves[-1]), model.comparable)
             for number, mode in enumerate(modes):
                 problem = mode.problem(states)
                 rates = problem.field(jnp.zeros(cells), states)
@@ -415,7 +272,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
                 falls = jnp.where(is_here, rate < 0.0, falls)
                 shift = jnp.where(is_here & falls, -value / jnp.where(rate < 0.0, rate, -1.0), 0.0)
                 states, total = states + shift * rates, total + shift
-            state = self.components(moved, states, mapped=False)
+            state = self.components(moved, states, first, mapped=False)
         return state, total, falls
 
     def newton(self, cells: int, leaves: tuple[Array, ...]) -> Newton:
@@ -569,15 +426,16 @@ def is_regular(values: Float[Array, "cells values"]) -> Bool[Array, "cells value
 
 
 def depth(part: Any) -> int:
-    """The number of axes of a start, which may consist of lists with traced numbers."""
+    """The number of axes of a start, which may consist of lists with traced numbers; 2 for several launches."""
+    part = jax.tree.leaves(part)[:1] if isinstance(part, eqx.Module) else part
     return 1 + max(map(depth, part), default=0) if isinstance(part, list | tuple) else np.ndim(part)
 
 
 def distinct_orbits(system: object, guesses: Any, event: Any, options: dict[str, Any]) -> list[Orbit]:
     """The distinct orbits that several guesses lead to, in the order of the guesses."""
     require_outside((system, guesses), "periodic_orbit of several guesses", "jax.vmap of periodic_orbit")
-    guesses = jax.tree.map(as_number, guesses if isinstance(guesses, tuple) else jnp.asarray(guesses, float))
-    batch = jax.vmap(lambda guess: periodic_orbit(system, guess, event, **options))(guesses)
+    guesses = guesses if isinstance(guesses, tuple | eqx.Module) else jnp.asarray(guesses, float)
+    batch = jax.vmap(lambda guess: periodic_orbit(system, guess, event, **options))(jax.tree.map(as_number, guesses))
     orbits: list[Orbit] = []
     for k in np.flatnonzero(np.asarray(batch.reason) == 0):
         orbit = jax.tree.map(lambda part, k=k: part[k], batch)
@@ -602,8 +460,10 @@ def periodic_orbit(
     t1: float = 1000.0,
     tolerance: float = 1e-10,
     solver: diffrax.AbstractERK | None = None,
+    input: object = None,
+    jumps: object = None,
 ) -> Any:
-    """A periodic orbit of your own system, by Newton's method on its return map; works under `jit`, `vmap`, `grad` and `jvp`.
+    """A periodic orbit, by Newton's method on the return map; works under `jit`, `vmap`, `grad` and `jvp`.
 
     The return map leads from a state to the state at the next crossing of a section, where an event function falls through
     zero, or after a given period. If the section is at a reset, the state is that after the reset. The map's Jacobian is exact,
@@ -611,16 +471,23 @@ def periodic_orbit(
     implicit function theorem; those of the multipliers are differences of exact derivatives at neighbouring orbits, with errors
     of about 1000 times the tolerance.
 
+    The orbit of a scene repeats up to the shifts that the scene allows: of place and direction on a level plane, along a
+    cylinder, and around a surface of revolution. Its `state` has the other numbers of a launch: of a stroller, such as `speed`;
+    of a top, such as `theta` and `angular_velocity_n`, where t1 is along the lean of the axis on a level plane, and the spin is
+    a part of the angular velocity. The section of a scene should not tell apart shifted motions, and the axis of a top must
+    lean there. A top that precesses steadily is at rest up to a shift, and no orbit; `tippe.steady` has these motions.
+
     If a quantity is conserved or the motion can be shifted, orbits form families, and Newton's method takes the shortest step,
     to an orbit of the family near the guess. Derivatives, also by the start, are then those at a start on an orbit, such as the
     `state` of an `Orbit`, and NaN for other starts.
 
     **Arguments:**
 
-    - `system`: your own system, a `Hybrid` or an `AbstractSystem`. Scenes are not available; `crossings` runs them.
-    - `start`: a guess of a state on the orbit, near the section, in the first mode. Several guesses have the shape
-      (guesses, components), or twice (guesses, coordinates) for an `AbstractSystem`.
-    - `event`, `direction`: the section, as for `crossings`; by default the event of the `Hybrid`.
+    - `system`, `input`, `jumps`: as for `event_time`; tops run on planes, cylinders and spheres, bodies of any shape on level
+      planes, and both with `contact="stop"`.
+    - `start`: a guess of a state on the orbit, near the section, in the first mode, or a launch. Several guesses have the shape
+      (guesses, components), or twice (guesses, coordinates) for an `AbstractSystem`, or are a list of launches.
+    - `event`, `direction`: the section, as for `crossings`; by default the event of the `Hybrid`. A scene needs an `event`.
     - `period`: the period [s] of a driven system, in place of a section. The drive begins at time 0.
     - `free`: names of the components that Newton's method changes, such as `["y0"]`; by default all. The others must be
       those of an orbit: a guess that is off the section is moved onto it only if all are free.
@@ -657,21 +524,23 @@ def periodic_orbit(
     if period is not None and event is not None:
         raise ValueError("event and period: pass the section or the period of a drive, not both")
     # A tuple consists of coordinates and rates.
+    first = start[0] if isinstance(start, list) and start else None
+    start = as_one(start, "start", type(first)) if isinstance(first, eqx.Module) else start
     if all(depth(part) == 2 for part in start) if isinstance(start, tuple) else depth(start) == 2:
         options = {"free": free, "symmetry": symmetry, "direction": direction, "t1": t1, "tolerance": tolerance}
-        return distinct_orbits(system, start, event, options | {"period": period, "solver": solver})
-    model: Any = model_of(system, start, section_of(event, direction, "after"))
-    if isinstance(model, AbstractSceneModel):
-        raise ValueError("system: periodic_orbit needs a Hybrid or an AbstractSystem; crossings runs scenes")
-    if period is None:
-        require_event(model)
-        if model.form.traits.depends_on_time:
-            raise ValueError("event: the system depends on time; pass period=, that of the drive, in place of event=")
-    else:
+        options |= {"period": period, "solver": solver, "input": input, "jumps": jumps}
+        return distinct_orbits(system, start, event, options)
+    model: AbstractModel = model_of(system, start, section_of(event, direction, "after"), input, jumps)
+    if period is not None:
         model = model.without_event()
+    else:
+        require_section(model, event)
+        if model.depends_on_time:
+            raise ValueError("event: the system depends on time; pass period=, that of the drive, in place of event=")
     horizon = t1 if period is None else period
     check_run(model, horizon, tolerance)
-    names = model.names
+    model = model.normalised()
+    names = model.reduced_names
     unknown = [name for name in free or () if name not in names]
     if unknown or (free is not None and (isinstance(free, str) or not len(free))):
         raise ValueError(f"free = {shown(free)} must be a list of some of {', '.join(names)}")
@@ -682,11 +551,10 @@ def periodic_orbit(
             shape = jax.eval_shape(mapped, state)
         if getattr(shape, "shape", None) != state.shape:
             raise ValueError(f"symmetry(y) must return a state of {len(names)} components, not {described(shape)}")
-        model = type(model).of(model.parameters.tree | {"symmetry": mapped})
+        model = dataclasses.replace(model, symmetry=Parameters.of({"symmetry": mapped}))
     places = tuple(k for k, name in enumerate(names) if free is None or name in free)
-    options = (period is not None, places, symmetry is not None)
     settings = settings_for_lanes(tolerance, solver)
-    search, *leaves = OrbitSolve.of(model, as_number(horizon), settings, *options)
+    search, *leaves = OrbitSolve.of(model, as_number(horizon), settings, period is not None, places)
     time, state, *parts = differentiable_solve(search, *leaves)
     real, imaginary, error, residual, *counts = parts
     family, iterations, reason = (jnp.asarray(count).astype(int) for count in counts)
@@ -696,6 +564,6 @@ def periodic_orbit(
         hint = "" if period is None or model.smooth else "; a reset near the end of the period has such an effect"
         if free is not None:
             hint = "; the components that are not free must be those of an orbit, on the section"
-        why = REASONS[int(reason)].format(t1=t1, residual=float(residual), hint=hint)
+        why = REASONS[int(reason)].format(t1=t1, residual=float(residual), hint=hint, at_rest=model.at_rest)
         raise ValueError(f"start: no periodic orbit was found: after {int(iterations)} Newton steps, {why}")
     return orbit

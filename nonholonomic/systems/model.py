@@ -149,6 +149,23 @@ class OwnModel(AbstractModel):
         return self.form.has_event
 
     @property
+    def depends_on_time(self) -> bool:
+        return self.form.traits.depends_on_time
+
+    def reduced(self, rows: Float[Array, "rows cells"], mode: object) -> Float[Array, "components cells"]:
+        # Runs keep by how much they violate constraints, so that orbits that violate them would be a family with others.
+        return jnp.asarray(self.components_of(self.on_constraints(rows)))
+
+    @property
+    def reduced_names(self) -> tuple[str, ...]:
+        return self.names
+
+    @property
+    def reduced_start(self) -> list[Array]:
+        pairs = zip(self.parameters.names, self.parameters.values, strict=True)
+        return [value for name, value in pairs if name.startswith("start") and value is not None]
+
+    @property
     def counters(self) -> dict[str, str]:
         return {} if self.smooth else {"switches": "resets"}
 

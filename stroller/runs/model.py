@@ -16,7 +16,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from nonholonomic import identification
 from nonholonomic.compilation.components import Held
-from nonholonomic.geometry import Plane
+from nonholonomic.compilation.tracing import dependent_outputs
+from nonholonomic.geometry import Cylinder, Plane
+from nonholonomic.geometry.vector import nearest_turn
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractProblem, Outcome
 from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_run
@@ -45,6 +47,9 @@ UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring":
 
 # The launch has a number of the same short name.
 UNITS |= {"scene.friction.steering": "N m s"}
+
+#: The numbers of a launch apart from the place.
+OF_A_LAUNCH = ("heading", "speed", "steering", "steering_rate")
 
 #: Descriptions of the axes.
 LONG_NAMES = {"scene.friction.steering": "damping of the steering", "steering_inertia": "inertia of the fork"}
@@ -177,6 +182,65 @@ class RideModel(AbstractSceneModel):
         ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched, self.jumps)
         # The state ends with the time if a quantity depends on the input.
         return ride if self.input is None or names is None or TIMED.isdisjoint(names) else with_clock(ride)
+
+    at_rest = "; steady circles and straight rides are no orbits"
+
+    @property
+    def depends_on_time(self) -> bool:
+        return super().depends_on_time or self._reads("t")
+
+    def _reads(self, *names: str) -> bool:
+        """Whether the input depends on some of its arguments, the time `t` and the parts of the motion."""
+        if self.input is None:
+            return False
+        shapes = eqx.filter_eval_shape(at_start, self.scene, self.launch)
+        t, motion = jax.tree.map(lambda part: jnp.zeros(()), shapes)
+        values = {"t": t, **motion._asdict()}
+
+        def returned(moved: dict[str, PyTree]) -> PyTree:
+            t, *parts = (values | moved).values()
+            return self.input(t, type(motion)(*parts))
+
+        return any(dependent_outputs(returned, {name: values[name] for name in names}))
+
+    @property
+    def reduced_names(self) -> tuple[str, ...]:
+        surface, names = self.scene.surface, [name for name, _ in self.scene.surface.coordinates]
+        # The ground is the same further along a plane or a cylinder, and around a surface of revolution.
+        shifts = names if isinstance(surface, Plane) else ["y"] if isinstance(surface, Cylinder) else ["mu"]
+        shifts = [] if self._reads("position", "heading") else shifts
+        turns = isinstance(surface, Plane) and surface.tilt is None and bool(shifts)
+        return (*(name for name in names if name not in shifts), *OF_A_LAUNCH[turns:])
+
+    @property
+    def reduced_start(self) -> list[Array]:
+        launch, names = self.launch, [name for name, _ in self.scene.surface.coordinates]
+        values = dict(zip(names, launch.place, strict=True)) | {name: getattr(launch, name) for name in OF_A_LAUNCH}
+        return [values[name] for name in self.reduced_names]
+
+    def normalised(self) -> "RideModel":
+        surface, coordinates = self.scene.surface, self.scene.surface.coordinates
+        if len(coordinates) == 3:
+            raise ValueError(f"system: periodic motions need a surface with coordinates, not {shown(surface)}")
+        state = self.reduced(self.scene.state(self.launch, self.input is not None)[:, None], None)[:, 0]
+        values = dict.fromkeys(["heading"], 0.0) | dict(zip(self.reduced_names, state, strict=True))
+        place = tuple(values.get(name, 0.0) for name, _ in coordinates)
+        launch = Launch(place, *(values[name] for name in OF_A_LAUNCH))
+        # The numbers of the input, too, may change.
+        controls = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, self.input)
+        return dataclasses.replace(self, launch=launch, input=controls)
+
+    def reduced(self, rows: Float[Array, "rows cells"], mode: object) -> Float[Array, "components cells"]:
+        coordinates, place = self.scene.surface.coordinates, self.launch.place
+        values = self.read(("place", *OF_A_LAUNCH), jnp.asarray(jnp.nan), rows, None)
+        values |= zip((name for name, _ in coordinates), jnp.moveaxis(values.pop("place"), -1, 0), strict=True)
+        if self.scene.heading == "projected" and "mu" in values and "mu" not in self.reduced_names:
+            # This angle is that from the fixed x axis, which does not turn with the place.
+            values["heading"] = values["heading"] - values["mu"]
+        angles = zip(coordinates, place, strict=True) if len(place) == len(coordinates) else ()
+        near = {"heading": self.launch.heading} | {name: angle for (name, unit), angle in angles if unit == "rad"}
+        values |= {name: nearest_turn(values[name], angle) for name, angle in near.items()}
+        return jnp.stack([values[name] for name in self.reduced_names])
 
     def without_event(self) -> "RideModel":
         return dataclasses.replace(self, event=None)

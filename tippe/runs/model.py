@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
-from nonholonomic.geometry import Plane
+from nonholonomic.geometry import Cylinder, Plane, Sphere, cross, scale, sum_vectors
+from nonholonomic.geometry.frames import CarriedFrame
+from nonholonomic.geometry.vector import nearest_turn, planar_length
 from nonholonomic.hybrid import BETWEEN, AbstractBatchedMode, HybridOutcome
 from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
 from nonholonomic.integration.problem import FAILED, Status
@@ -25,12 +27,13 @@ from nonholonomic.validation import Bound, Function, all_bounds, explaining, leg
 
 from ..friction import NoSlip
 from ..model.body import Top
-from ..model.dynamics import LOSSES, NO_COSINE
+from ..model.dynamics import LOSSES, NO_COSINE, inclination, parts
+from ..model.rigid import AbstractRigidBody
 from ..model.scene import SPINS, Launch, Scene, generic_direction
 from ..modes.airborne import airborne_modes
 from ..modes.plane import hopping_modes
 from ..modes.problems import BEHIND_PATH, INVERTED, InversionProblem, StemContact, event_of, trajectory_problem
-from ..modes.sticking import above_the_ground, energy_in, loss, stick_slip_modes
+from ..modes.sticking import ROLLING, above_the_ground, energy_in, loss, stick_slip_modes
 from .observables import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, AbstractTrajectory, allowance, quantities_of
 from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
@@ -92,6 +95,9 @@ SEVERAL = {
     "angular_velocity": [(f"angular_velocity_{axis}", "rad s-1") for axis in ("t1", "t2", "n")],
 }
 
+#: All of these names.
+LABELS = tuple(label for parts in SEVERAL.values() for label, _ in parts)
+
 #: Parameters of a launch that can be varied.
 NUMBERS_OF_A_LAUNCH = [f"launch.{name}" for name in ("theta", "spin", "eta", "azimuth")]
 NUMBERS_OF_A_LAUNCH += [
@@ -140,6 +146,8 @@ class TopModel(AbstractSceneModel):
     angle: Any = None
     event: EventFunction | None = None
     reverses: bool = eqx.field(static=True, default=False)
+    #: The index of the first mode, if it is known: round-off would let a rolling start slip.
+    first: Int[Array, "..."] | None = None
 
     components = COMPONENTS
     comparable = ("direction",)
@@ -262,6 +270,66 @@ class TopModel(AbstractSceneModel):
                 "second derivatives do not exist through changes of mode: contact = 'hybrid', SetValuedCoulomb"
             )
 
+    at_rest = "; a steady motion is no orbit, and tippe.steady has those of tops"
+
+    @property
+    def reduced_names(self) -> tuple[str, ...]:
+        scene = self.scene
+        # A body of revolution that leans in another direction is the same, where all directions are alike.
+        is_shifted = scene.level and scene.friction.isotropic and not isinstance(scene.body, AbstractRigidBody)
+        place = ("eta",) * isinstance(scene.surface, Cylinder | Sphere) + ("azimuth",) * (not is_shifted)
+        return ("theta", *place, *(() if isinstance(scene.friction, NoSlip) else LABELS[:2]), *LABELS[2:])
+
+    @property
+    def reduced_start(self) -> list[Array]:
+        launch = self.launch
+        velocity = () if isinstance(self.scene.friction, NoSlip) else launch.velocity or ()
+        place = [getattr(launch, name) for name in ("theta", "eta", "azimuth") if name in self.reduced_names]
+        return [*place, *velocity, *(launch.angular_velocity or ())]
+
+    def normalised(self) -> "TopModel":
+        scene = self.scene
+        if isinstance(scene.frame, CarriedFrame) or (isinstance(scene.body, AbstractRigidBody) and not scene.level):
+            place = "a level plane for this body" if scene.contact == "stop" else "contact = 'stop'"
+            raise ValueError(f"system: periodic motions are found on planes, cylinders and spheres; choose {place}")
+        first = jnp.zeros(1, int) if self.smooth else self.modes(1, jnp.asarray(1e-9), self.comparable, False)[1]
+        state = self.reduced(scene.state(self.launch)[:, None], first)[:, 0]
+        values = dict(zip(self.reduced_names, state, strict=True))
+        velocity = None if isinstance(scene.friction, NoSlip) else tuple(state[-5:-3])
+        numbers = (values["theta"], 0.0, values.get("eta", 0.0), values.get("azimuth", 0.0))
+        launch = Launch(*numbers, velocity=velocity, angular_velocity=tuple(state[-3:]))
+        return dataclasses.replace(self, launch=launch, first=None if self.smooth else first[0])
+
+    def reduced(self, rows: Float[Array, "rows cells"], mode: Int[Array, " cells"]) -> Float[Array, "components cells"]:
+        scene, launch = self.scene, self.launch
+        inside, is_rigid = -scene.surface.sign(scene.side, "inside"), isinstance(scene.body, AbstractRigidBody)
+        state = rows[: 8 + len(scene.frame.lengths) + 3 * is_rigid]
+        if scene.friction.set_valued:
+            state = jnp.where(mode == ROLLING, scene.dynamics.rolling.carried_along(state), state)
+        (u, e, _, place), w = parts(state), scene.dynamics.rotation(state)[0]
+        if isinstance(scene.body, Top):
+            u = sum_vectors(u, scale(scene.body.offset, cross(w, e)[:2]))
+        # The angle from the frame's first tangent to that of a launch.
+        east, lean = jnp.zeros_like(e[0]), jnp.arctan2(e[1], e[0])
+        if "azimuth" not in self.reduced_names:
+            east = lean
+        elif scene.level and is_rigid:
+            # The direction of the normal in the body's axes, of which x is the last part of the place.
+            east = lean - jnp.arctan2(-cross(e, place[-3:])[2], -place[-1])
+        elif isinstance(scene.surface, Sphere):
+            east = jnp.arctan2(inside * place[1], inside * place[0])
+        cosine, sine = jnp.cos(east), jnp.sin(east)
+        (x, y), *others = (
+            (cosine * part[0] + sine * part[1], cosine * part[1] - sine * part[0], *part[2:]) for part in (e[:2], u, w)
+        )
+        azimuth = nearest_turn(jnp.arctan2(y, x), launch.azimuth)
+        values = {"theta": inclination(e), "azimuth": azimuth} | dict(zip(LABELS, sum(others, ()), strict=True))
+        if isinstance(scene.surface, Sphere):
+            values["eta"] = jnp.arctan2(planar_length(place[0], place[1]), inside * place[2])
+        elif isinstance(scene.surface, Cylinder):
+            values["eta"] = nearest_turn(jnp.arctan2(inside * place[0], inside * place[1]), launch.eta)
+        return jnp.stack([values[name] for name in self.reduced_names])
+
     @property
     def further_times(self) -> dict[str, tuple[str, AbstractModel]]:
         if not self.scene.has_stem or self.event is not None:
@@ -284,7 +352,9 @@ class TopModel(AbstractSceneModel):
             # A turning frame turns by a different angle for each launch, and the difference would count as divergence.
             return dataclasses.replace(problem, dynamics=self.scene.dynamics) if names else problem
         scene, run = self.scene, trajectory_problem((self.scene, self.launch), cells)
-        needs = {PASSIVE} if names is None else set().union(*(self.quantities[name].needs for name in names))
+        # Nearby runs are compared in a frame that does not turn.
+        needs = {PASSIVE} if names is None else set(names).intersection(self.comparable or ())
+        needs = needs.union(*(self.quantities[name].needs for name in names or () if name not in needs))
         if PASSIVE in needs:
             return run
         # Only some quantities need the path, and few need rotation or work. On the plane, a run without path, rotation and
@@ -297,10 +367,12 @@ class TopModel(AbstractSceneModel):
         return CoreProblem(run, len(run.start()[0]) - BEHIND_PATH if has_path else run.leading)
 
     def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
-        if (problem := self._without_path(cells, names)) is not None:
-            return (*modes_of(self.scene, problem, tolerance, continues), problem.states)
-        problem = _start_with_path(self.scene, self.launch, cells)
-        return (*modes_of(self.scene, problem, tolerance, last=False, with_quadratures=True), problem.states)
+        if self.smooth:
+            return super().modes(cells, tolerance, names, continues)
+        core = self._without_path(cells, names)
+        problem = _start_with_path(self.scene, self.launch, cells) if core is None else core
+        modes, first = modes_of(self.scene, problem, tolerance, continues and core is not None, core is None)
+        return modes, first if self.first is None else jnp.broadcast_to(self.first, cells), problem.states
 
     @property
     def quantities(self) -> dict[str, Quantity]:

@@ -7,7 +7,6 @@ import pytest
 from own_modes import GRAVITY, Pendulum
 from scipy.special import ellipk
 
-import tippe
 from nonholonomic import AbstractMode, AbstractSystem, Hybrid, periodic_orbit
 
 
@@ -363,8 +362,5 @@ def test_what_is_wrong_is_said():
         periodic_orbit(system, [0.0, 0.8], wall, period=3.0)
     with pytest.raises(ValueError, match="depends on time"):
         periodic_orbit(Hybrid([Driven(0.2, 1.0)]), [0.0, 0.8], turning)
-    top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
-    with pytest.raises(ValueError, match="crossings runs scenes"):
-        periodic_orbit(tippe.Scene(top), tippe.Launch(0.1, 155.0), lambda t, motion: 0.3 - motion.theta)
     with pytest.raises(ValueError, match="free = "):
         periodic_orbit(system, [0.0, 0.8], wall, free=["speed"])
