@@ -134,9 +134,10 @@ class AbstractSystem(eqx.Module):
     strikes something, write `margin` and `reset` as well.
 
     Where `metric`, `potential`, `constraints`, `drift` or `lagrangian` depends on time, write the time as the first argument
-    and call it `t`, as in `metric(self, t, q)`. Runs of a system with such a function or with a drift also have the quantities
-    `energy` and `support_power`, the power that moving supports put in. With the rates q', the drift d, the multipliers lambda
-    and the Lagrangian L, this power is lambda.d - dL/dt, and the energy changes by it and by the power of the `force`.
+    and call it `t`, as in `metric(self, t, q)`. Runs of a system with such a function or with a drift, unless as a mode of a
+    `Hybrid`, also have the quantities `energy` and `support_power`, the power that moving supports put in. With the drift d,
+    the multipliers lambda and the Lagrangian L, this power is lambda.d - dL/dt, and the energy changes by it and by the power
+    of the `force`.
 
     **Example:** a bead on a parabolic wire z = x^2 / 2, which oscillates in about 2 pi / sqrt(g).
 
@@ -561,12 +562,12 @@ class Lagrange(AbstractFormulation):
 def formulation_of(system: AbstractSystem) -> AbstractFormulation:
     """The equations of motion for a mechanical system.
 
-    If the system has its own frame, or its own Lagrangian (which may have terms linear in the velocities), the
-    equations are in quasi-velocities, which obey the constraints exactly; otherwise, and with a drift or functions of time,
+    If the system has its own frame, or no constraints and its own Lagrangian (which may have terms linear in the velocities),
+    the equations are in quasi-velocities, which obey the constraints exactly; otherwise, and with a drift or functions of time,
     they use Lagrange multipliers.
     """
-    has_fields = is_own(system, "frame") or is_own(system, "lagrangian")
-    return Hamel(system) if has_fields and not is_driven(system) else Lagrange(system)
+    is_free = is_own(system, "lagrangian") and system.freedom == system.dimension
+    return Hamel(system) if (is_own(system, "frame") or is_free) and not is_driven(system) else Lagrange(system)
 
 
 def energy_and_support_power(

@@ -9,6 +9,7 @@ from close import assert_close
 from own_modes import GRAVITY, Sleigh, Turntable
 
 from nonholonomic import AbstractSystem, Hybrid, periodic_orbit, simulate, sweep
+from nonholonomic.runs.model import model_of
 from nonholonomic.systems.form import check_start
 from nonholonomic.systems.mechanics import Lagrange, energy_and_support_power, is_driven
 
@@ -122,6 +123,21 @@ class Fenced(Turntable):
         return q, rate * jnp.array([-0.5, 1.0, 1.0, 1.0])
 
 
+class OnTable(Turntable):
+    """The ball on a turntable, its place in the coordinates of the table."""
+
+    def constraints(self, t, q):
+        c, s = jnp.cos(self.turn * t), jnp.sin(self.turn * t)
+        return jnp.array([[c, -s, 0.0, -self.radius], [s, c, self.radius, 0.0]])
+
+    def drift(self, q):
+        return jnp.zeros(2)
+
+    def lagrangian(self, q, rate):
+        velocity = rate[:2] + self.turn * jnp.array([-q[1], q[0]])
+        return 0.5 * self.mass * (velocity @ velocity + 0.4 * self.radius**2 * rate[2:] @ rate[2:])
+
+
 class Racket(AbstractSystem):
     """A ball above a racket that moves up and down, in two coordinates."""
 
@@ -158,6 +174,44 @@ def test_a_ball_on_a_turntable_runs_in_a_circle_and_the_table_pays_for_it():
     work = scipy.integrate.simpson(run["support_power"], x=run.t)
     assert_close(run["energy"][-1] - run["energy"][0], work, rtol=1e-8)
     assert run.to_table()["energy"].shape == (501,)
+
+
+def test_in_the_coordinates_of_the_table_the_motion_is_the_same():
+    """The Lagrangian has a term linear in the rates and the constraints depend on time, as the rotations of the ball are about
+    axes at rest."""
+    table, t = OnTable(TURN), 0.4
+    place, velocity = circle(TURN, t)
+    back = np.exp(-1j * TURN * t)
+    # Relative to the table, by the rule of products.
+    seen, rate = back * place, back * (velocity - 1j * TURN * place)
+    expected = back * (2j / 7.0 * TURN * velocity - 2j * TURN * velocity - TURN**2 * place)
+    turning = back.conjugate() * rate / table.radius
+    q, rates = (
+        jnp.array([seen.real, seen.imag, 0.0, 0.0]),
+        jnp.array([rate.real, rate.imag, -turning.imag, turning.real]),
+    )
+    acceleration = jax.jit(lambda: Lagrange(table).acceleration(t, q, rates))()
+    assert_close(acceleration[0] + 1j * acceleration[1], expected, rtol=1e-12)
+
+
+def test_the_power_of_the_supports_is_that_of_the_multipliers():
+    """Also with a force; the equations with multipliers are solved as one linear system."""
+    table = Turntable(TURN, drag=0.3)
+    q, rate = table.start(0.3, 0.1, 0.2, -0.1)
+    G, W, force = table.metric(q), table.constraints(q), table.force(0.0, q, rate)
+    equations = np.block([[G, -W.T], [W, np.zeros((2, 2))]])
+    *acceleration, first, second = np.linalg.solve(equations, np.concatenate([force, table.drift(rate[:2])]))
+    _, power = jax.jit(lambda: energy_and_support_power(table, 0.0, q, rate))()
+    assert_close(power, np.array([first, second]) @ table.drift(q), rtol=1e-12)
+    assert_close(jax.jit(lambda: Lagrange(table).acceleration(0.0, q, rate))(), np.array(acceleration), rtol=1e-12)
+
+
+def test_an_impact_keeps_the_drift():
+    fenced = Fenced(TURN)
+    q, rate = fenced.start(0.5, 0.1, 0.2, -0.1)
+    after = jax.jit(lambda: fenced.impact(0.0, q, rate, 0.7))()
+    assert_close(after[0], -0.7 * 0.2, rtol=1e-12)
+    assert_close(fenced.constraints(q) @ after, fenced.drift(q), rtol=1e-12)
 
 
 def check_slope(end, number):
@@ -285,7 +339,7 @@ def test_an_impact_counts_the_motion_of_the_obstacle():
     assert_close(Racket().impact(t, jnp.array([0.0, 0.2 * np.sin(1.2)]), rate, 0.6), expected, rtol=1e-12)
 
 
-def test_a_lagrangian_of_its_own_runs_in_a_mode():
+def test_a_lagrangian_of_its_own_runs_with_constraints_and_in_a_mode():
     """That of the sleigh, written out, gives the accelerations of its metric."""
 
     class Stated(Sleigh):
@@ -293,7 +347,8 @@ def test_a_lagrangian_of_its_own_runs_in_a_mode():
             return 0.5 * rate @ self.metric(q) @ rate
 
     q, rate = jnp.array([0.1, 0.2, 0.4]), 1.5 * jnp.array([jnp.cos(0.4), jnp.sin(0.4), 0.5])
-    check_start(Hybrid([Stated()]), (q, rate))
+    for system in (Stated(), Hybrid([Stated()])):
+        model_of(system, (q, rate)).check()
     accelerations = jax.jit(lambda: [Lagrange(kind()).acceleration(0.0, q, rate) for kind in (Stated, Sleigh)])()
     assert_close(*accelerations, rtol=1e-12)
 
