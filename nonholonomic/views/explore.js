@@ -89,7 +89,7 @@
     live.outcome = { status: words[outcome[0]], value: outcome[1], end: run.times[run.times.length - 1] };
   }
 
-  let waiting = false, later = 0;
+  let soon = 0, later = 0;
   function set(wanted, source = null) {
     values = wanted.map((value, k) => Math.min(sliders[k].high, Math.max(sliders[k].low, value)));
     knobs.forEach(({ input, shown }, k) => {
@@ -100,10 +100,9 @@
     });
     map.update(values);
     clearTimeout(later);
-    later = setTimeout(() => { simulate(3000); remember(); }, 150);
-    if (waiting) return;
-    waiting = true;
-    requestAnimationFrame(() => { waiting = false; simulate(400); });
+    // A browser does not draw a hidden page: without this, its few frames would replace the many when it is shown.
+    later = setTimeout(() => { cancelAnimationFrame(soon); soon = 0; simulate(3000); remember(); }, 150);
+    soon ||= requestAnimationFrame(() => { soon = 0; simulate(400); });
   }
 
   // Write the slider values into the page's address, so that a copied link opens the same run.

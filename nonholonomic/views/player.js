@@ -80,7 +80,8 @@ window.views = window.views || {};
       button("Reset", "the first view", () => { toggle(follow, (stage.follows = fact.follow)); toggle(orbit, (stage.orbits = false)); stage.reset(); stage.render(); });
       const toggle = (one, on) => one.setAttribute("aria-pressed", String(on));
       toggle(follow, stage.follows); toggle(orbit, false);
-      if (fact.title) element("b", caption, { textContent: fact.title });
+      // Of a single stage, the heading of the page may say it already.
+      if (fact.title && fact.title !== document.title) element("b", caption, { textContent: fact.title });
       const notes = new Set(fact.runs.map((run) => run.note).filter(Boolean));
       for (const note of notes) element("span", caption, { className: "warning", textContent: note });
       const names = fact.runs.length > 1 ? fact.runs.map((run) => [run.name, run.colour]) : [];

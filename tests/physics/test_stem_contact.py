@@ -12,6 +12,7 @@ from stems import first_contact
 
 import tippe
 from nonholonomic.sweeps import Table
+from tippe.runs.view import motion
 
 LAUNCH, T1, TOLERANCE = tippe.Launch.degrees(theta=6, rpm=1500), 5.0, 1e-10
 
@@ -59,6 +60,15 @@ def test_the_stem_carries_the_top_from_its_first_contact(run):
     assert 0.0 <= scan.t[np.argmax(on_stem)] - run.stem_time <= 1.01e-6
     # Before, the sphere carried the top all the time.
     assert (run.contact[run.t < run.stem_time] == 0).all()
+
+
+def test_the_trace_of_a_stem_that_bounces_is_no_zigzag(run):
+    """It jumps from the sphere to the stem and back, but not in the flights between two contacts of the same one."""
+    times, drawn = motion(run)
+    trace, sphere = drawn.traces[0][0], run.at(times).contact
+    far = np.linalg.norm(np.diff(trace, axis=0), axis=-1) > 0.5 * float(run.scene.body.radius)
+    touching = sphere[sphere >= 0]
+    assert 0 < far.sum() <= np.sum(np.diff(touching) != 0) < np.sum(np.diff(sphere) != 0)
 
 
 def test_a_run_that_does_not_reach_its_stem_has_no_time(run):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -228,6 +229,22 @@ def test_a_slider_simulates_anew(browser, page, rutstam_scene):
     matrix = browser.execute_script("player.seek(1.0); return player.matrix(0, 0, 0)")
     run = tippe.simulate(rutstam_scene, tippe.Launch(theta, spin), 1.0, times=[1.0])
     np.testing.assert_allclose(np.array(matrix).reshape(4, 4)[3, :3], run.position[0], atol=1e-4)
+
+
+def test_a_page_that_was_hidden_keeps_its_many_frames(browser, page):
+    """A browser calls back for a frame only once the page is shown, after the simulation with many frames."""
+    reset(browser)
+    browser.execute_script(
+        "const ask = requestAnimationFrame, forget = cancelAnimationFrame; let held = new Map();"
+        "window.requestAnimationFrame = (act) => { held.set(held.size + 1, act); return held.size; };"
+        "window.cancelAnimationFrame = (number) => held.delete(number);"
+        "window.shown = () => { Object.assign(window, { requestAnimationFrame: ask, cancelAnimationFrame: forget });"
+        " held.forEach((act) => act()); };"
+        "live.set([0.2, 155])"
+    )
+    wait(browser, "return player.stages[0].fact.runs[0].times.length > 500 && live.values()[0] === 0.2")
+    time.sleep(0.3)
+    assert browser.execute_script("shown(); return player.stages[0].fact.runs[0].times.length") > 500
 
 
 def test_the_address_holds_the_sliders(browser, page):

@@ -72,7 +72,9 @@ def frames(run: AbstractTrajectory) -> Frame[Array]:
         contact, offset = position - body.radius * normal, body.offset
         if body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
-            contact = jnp.where((run.contact == 1)[:, None], stem, contact)
+            # In flight that of the stem if it is clearly lower: the trace of a stem that bounces would be a zigzag.
+            is_lower = ((contact - stem) * normal).sum(axis=-1) > 0.02 * radius
+            contact = jnp.where(((run.contact == 1) | (run.contact < 0) & is_lower)[:, None], stem, contact)
     # Above the ground, where lines are visible.
     above, centre = contact + 0.02 * radius * normal, position - offset * axis
     rotation = (run.angular_velocity * normal).sum(axis=-1) if isinstance(body, AbstractRigidBody) else run.jellett
