@@ -13,7 +13,7 @@
       : Math.abs(number) >= 10 ** count ? String(Math.round(number)) : number.toPrecision(count);
   // A value in the unit of the page, and in degrees or revolutions per minute if that is the SI unit.
   function withUnit(value, { name, unit, factor }) {
-    const other = unit === "rad" ? `${digits((180 * value) / Math.PI, 3)}°` : unit === "rad/s" && name.endsWith("spin") ? `${Math.round((30 * value) / Math.PI)} rpm` : "";
+    const other = unit === "rad" ? `${digits((180 * value) / Math.PI, 3)} deg` : unit === "rad/s" && name.endsWith("spin") ? `${Math.round((30 * value) / Math.PI)} rpm` : "";
     return `${digits(factor * value, 3)} ${unit}${other && ` = ${other}`}`;
   }
   const knobs = sliders.map((slider, k) => {
@@ -51,8 +51,13 @@
     };
   }
 
+  // The word for the end of a run until the answer; the whole run of a top may end upright again.
+  function wordOf([status], run) {
+    const word = (words[status] || "illegal").replace(/_/g, " "), angle = run.curves[0].values;
+    return word === "inverted" && angle[angle.length - 1] < Math.PI / 2 ? "inverted, but fell back" : word;
+  }
   function tell(outcome, run, took) {
-    const [status, found] = outcome, word = (words[status] || "illegal").replace(/_/g, " ");
+    const found = outcome[1], word = wordOf(outcome, run);
     result.replaceChildren();
     element("span", result, { textContent: facts.answer.label });
     element("strong", result, { textContent: Number.isFinite(found) ? `${digits(found)} ${facts.answer.unit}` : word });
@@ -80,8 +85,8 @@
     }
     asks.run(values);
     const outcome = asks.read("outcome", values), took = performance.now() - began;
-    const run = recorded(most), word = words[outcome[0]] || "illegal";
-    const marked = `${word === "inverted" ? "turned over" : word.replace(/_/g, " ")} at ${digits(outcome[1], 3)} s`;
+    const run = recorded(most), [first, ...rest] = wordOf(outcome, run).split(", but");
+    const marked = [`${first === "inverted" ? "turned over" : first} at ${digits(outcome[1], 3)} s`, ...rest].join(",");
     // The answer may be another quantity than a time.
     run.marks = facts.answer.unit === "s" && Number.isFinite(outcome[1]) ? [[outcome[1], marked]] : [];
     tell(outcome, run, took);

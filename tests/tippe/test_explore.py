@@ -231,6 +231,23 @@ def test_a_slider_simulates_anew(browser, page, rutstam_scene):
     np.testing.assert_allclose(np.array(matrix).reshape(4, 4)[3, :3], run.position[0], atol=1e-4)
 
 
+def test_a_page_says_that_a_top_fell_back(browser, page):
+    """A run whose angle is small in the end."""
+    reset(browser)
+    texts = "return [document.querySelector('#result .word').textContent, player.stages[0].fact.runs[0].marks[0][1]]"
+    word, mark = browser.execute_script(
+        "const { trajectory } = live.moves; live.moves.trajectory = (...given) => { const run = trajectory(...given);"
+        " return { ...run, read: (times) => run.read(times).map((row) => {"
+        "  const all = [...row]; all[all.length - 5] = 0.1; return all; }) }; };"
+        f"live.simulate(400); live.moves.trajectory = trajectory; {texts}"
+    )
+    assert word == "inverted, but fell back"
+    assert re.fullmatch(r"turned over at 5\.\d+ s, fell back", mark)
+    word, mark = browser.execute_script(f"live.simulate(400); {texts}")
+    assert word == "inverted"
+    assert "fell back" not in mark
+
+
 def test_a_page_that_was_hidden_keeps_its_many_frames(browser, page):
     """A browser calls back for a frame only once the page is shown, after the simulation with many frames."""
     reset(browser)
