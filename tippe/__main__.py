@@ -89,7 +89,7 @@ def remark(options: argparse.Namespace) -> str:
     angle = f"{math.degrees(angle_counted(options)):.0f} deg"
     if TOPS[options.top]().stem is None:
         return f"A top has turned over when theta first exceeds {angle}."
-    return f"A top has turned over when its stem first carries it; on a table the stem touches at {angle}."
+    return f"A top has turned over when its stem first carries it (it may fall back); on a table the stem touches at {angle}."
 
 
 def angle_counted(options: argparse.Namespace) -> float:
