@@ -394,6 +394,7 @@ def _check_functions(form: Form, prefix: str, names: tuple[str, ...]) -> None:
         "lagrangian": ("one number", lambda shape: shape == ()),
         "frame": (f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
         "force": (f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
+        "input": (f"of shape ({n}, ports), a column for each port", lambda shape: len(shape) == 2 and shape[0] == n),
         "margin": (
             "one number, an array of shape (k,), a dict of numbers by name, or None",
             lambda shape: shape is None or (shape != "" and (set(shape) == {()} or len(shape) < 2)),

@@ -124,6 +124,9 @@ class AbstractMode(eqx.Module):
 
 Coordinates = Float[Array, " n"]
 
+#: The input of a run, a function of time, coordinates and rates: u(t, q, q') -> (ports,).
+Input = Callable[[Number, Coordinates, Coordinates], ArrayLike]
+
 
 class AbstractSystem(eqx.Module):
     """A mechanical system with n coordinates and k linear constraints on its velocity.
@@ -138,6 +141,9 @@ class AbstractSystem(eqx.Module):
     `Hybrid`, also have the quantities `energy` and `support_power`, the power that moving supports put in. With the drift d,
     the multipliers lambda and the Lagrangian L, this power is lambda.d - dL/dt, and the energy changes by it and by the power
     of the `force`.
+
+    A system with ports, `input(self, q)`, is driven by the `input=` of a run, a function u(t, q, rate) that returns a number
+    for each port. Such a run also has these quantities, and `input_power`, which changes the energy too.
 
     **Example:** a bead on a parabolic wire z = x^2 / 2, which oscillates in about 2 pi / sqrt(g).
 
@@ -209,6 +215,12 @@ class AbstractSystem(eqx.Module):
     def force(self, t: Number, q: Coordinates, rate: Coordinates) -> Coordinates:
         """Generalised force f(t, q, q') in addition to that of the potential; zero by default."""
         return jnp.zeros_like(q)
+
+    def input(self, q: Coordinates) -> Float[Array, "n ports"]:
+        """Ports B(q), one per column: the `input` u of a run adds the generalised force B u and the power u.(B^T q'); no ports
+        by default.
+        """
+        return jnp.zeros((q.size, 0), q.dtype)
 
     def margin(self, t: Number, q: Coordinates, rate: Coordinates) -> Margin:
         """A smooth function that is positive while the system moves freely and falls through zero where it strikes something,
@@ -304,7 +316,7 @@ class AbstractSystem(eqx.Module):
 
 #: The functions of a system that may have the time as a further first argument, and all its functions, with their arguments.
 TIMED = dict.fromkeys(("metric", "potential", "constraints", "drift"), "q") | {"lagrangian": "q, rate"}
-ARGUMENTS = TIMED | {"frame": "q"} | dict.fromkeys(("force", "margin", "reset"), "t, q, rate")
+ARGUMENTS = TIMED | {"frame": "q", "input": "q"} | dict.fromkeys(("force", "margin", "reset"), "t, q, rate")
 
 
 def is_own(system: object, name: str) -> bool:
@@ -419,9 +431,11 @@ class AbstractFormulation(AbstractMode):
     **Arguments:**
 
     - `system`: the data, an `AbstractSystem`.
+    - `input`: a function u(t, q, q') -> (ports,) that acts through the ports of the system, or `None`.
     """
 
     system: eqx.AbstractVar[AbstractSystem]
+    input: eqx.AbstractVar[Input | None]
 
     #: Whether states may have rates that violate the constraints, so that `entered` changes them.
     is_projected: ClassVar[bool] = False
@@ -433,6 +447,17 @@ class AbstractFormulation(AbstractMode):
     @abc.abstractmethod
     def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
         """Coordinates and velocity, each (n,), of a state."""
+
+    def input_force(self, t: Number, q: Coordinates, rate: Coordinates) -> Coordinates:
+        """The generalised force of the input."""
+        if self.input is None:
+            return jnp.zeros_like(q)
+        return self.system.input(q) @ jnp.atleast_1d(jnp.asarray(self.input(t, q, rate)))
+
+    def force(self, t: Number, q: Coordinates, rate: Coordinates) -> Coordinates:
+        """The generalised force of the system and of the input."""
+        force = self.system.force(t, q, rate)
+        return force if self.input is None else force + self.input_force(t, q, rate)
 
     def acceleration(self, t: Number, q: Coordinates, rate: Coordinates) -> Coordinates:
         """Second derivative of the coordinates, by the chain rule through this formulation's state."""
@@ -466,12 +491,11 @@ class Hamel(AbstractFormulation):
     the quasi-velocities of the frame's last fields, but not their momenta, which carry the nonholonomic terms (Hamel).
     The Lagrangian may have terms linear in the velocity, as that of a Routhian has. The state is (q, u).
 
-    **Arguments:**
-
-    - `system`: the data, an `AbstractSystem`.
+    **Arguments:** as for `AbstractFormulation`.
     """
 
     system: AbstractSystem
+    input: Input | None = None
 
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
         rate = within_constraints(self.system, q, rate)
@@ -501,7 +525,7 @@ class Hamel(AbstractFormulation):
         # c^k_ji p_k is the bracket [E_j, E_i] paired with dL/dq', of which p_k is the part along E_k.
         gradient = jax.grad(system.lagrangian, argnums=1)(q, rate)
         gyroscopic = jnp.einsum("kji,j,k->i", lie_brackets(system.frame, q), u, gradient)
-        forces = E.T @ (jax.grad(lagrangian)(q, u) + system.force(t, q, rate)) + gyroscopic - swell
+        forces = E.T @ (jax.grad(lagrangian)(q, u) + self.force(t, q, rate)) + gyroscopic - swell
         return jnp.concatenate([rate, solve(inertia, forces[:free], positive=True)])
 
 
@@ -513,12 +537,11 @@ class Lagrange(AbstractFormulation):
     The state is (q, q'), so one linear system with the metric is solved for the force and the rows of W together. The metric
     may be singular if it is positive for the allowed rates, as with parts without mass. Source: `stroller.md`, section 6, F1.
 
-    **Arguments:**
-
-    - `system`: the data, an `AbstractSystem`.
+    **Arguments:** as for `AbstractFormulation`.
     """
 
     system: AbstractSystem
+    input: Input | None = None
 
     @property
     def is_projected(self) -> bool:
@@ -547,7 +570,7 @@ class Lagrange(AbstractFormulation):
         now = at_time(system, t)
         times = () if now is system else (jnp.asarray(t, float),)
         (W, G, _), (bend, swell, pull) = jax.jvp(seen, (q, *times), (rate, *map(jnp.ones_like, times)))
-        free = jax.grad(now.lagrangian)(q, rate) + system.force(t, q, rate)
+        free = jax.grad(now.lagrangian)(q, rate) + self.force(t, q, rate)
         free -= swell if has_lagrangian else swell @ rate
         G = jax.hessian(now.lagrangian, argnums=1)(q, rate) if has_lagrangian else G
         # The masses may jump in time without an effect on the motion: as a traced function, they are known for it.
@@ -559,29 +582,32 @@ class Lagrange(AbstractFormulation):
         return unconstrained - by_constraints @ solve(per_multiplier, excess, positive=True)
 
 
-def formulation_of(system: AbstractSystem) -> AbstractFormulation:
-    """The equations of motion for a mechanical system.
+def formulation_of(system: AbstractSystem, input: Input | None = None) -> AbstractFormulation:
+    """The equations of motion for a mechanical system and its input.
 
     If the system has its own frame, or no constraints and its own Lagrangian (which may have terms linear in the velocities),
     the equations are in quasi-velocities, which obey the constraints exactly; otherwise, and with a drift or functions of time,
     they use Lagrange multipliers.
     """
     is_free = is_own(system, "lagrangian") and system.freedom == system.dimension
-    return Hamel(system) if (is_own(system, "frame") or is_free) and not is_driven(system) else Lagrange(system)
+    is_hamel = (is_own(system, "frame") or is_free) and not is_driven(system)
+    return Hamel(system, input) if is_hamel else Lagrange(system, input)
 
 
-def energy_and_support_power(
-    system: AbstractSystem, t: Number, q: Coordinates, rate: Coordinates
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The energy E, and the power lambda.d - dL/dt that moving supports put in.
+def energy_balance(
+    system: AbstractSystem, input: Input | None, t: Number, q: Coordinates, rate: Coordinates
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """The energy E, the power lambda.d - dL/dt that moving supports put in, and the power of the input.
 
-    The power is dE/dt - f.q': from d/dt(dL/dq') = dL/dq + f + W^T lambda and E = q'.dL/dq' - L follows
+    The power of the supports is dE/dt - f.q': from d/dt(dL/dq') = dL/dq + f + W^T lambda and E = q'.dL/dq' - L follows
     dE/dt = q'.f + lambda.W q' - dL/dt, and the constraints are W q' = d.
     """
-    acceleration = Lagrange(system).acceleration(t, q, rate)
-    point, direction = (jnp.asarray(t, float), q, rate), (np.ones(()), rate, acceleration)
+    equations = Lagrange(system, input)
+    point = (jnp.asarray(t, float), q, rate)
+    direction = (np.ones(()), rate, equations.acceleration(t, q, rate))
     energy, change = jax.jvp(lambda t, q, rate: at_time(system, t).energy(q, rate), point, direction)
-    return energy, change - jnp.sum(system.force(t, q, rate) * rate)
+    powers = [jnp.sum(force(t, q, rate) * rate) for force in (equations.force, equations.input_force)]
+    return energy, change - powers[0], powers[1]
 
 
 # Whether runs of a user's system may start: rules for concrete and traced numbers, and their messages.

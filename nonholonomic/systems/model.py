@@ -24,7 +24,7 @@ from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
 from ..runs.trajectory import TOLERANCE, Trajectory, frame_of, live_run, page_of, runs_at_ends, sliders_of, stage_of
 from ..sweeps import Axis, Quantity, Variable
-from ..text import name_of, shown
+from ..text import counted, name_of, shown
 from ..validation import as_number, is_traced
 from ..views import Stage
 from ..views.explore import Frame, LiveRun, Summary
@@ -36,8 +36,8 @@ from .mechanics import AbstractSystem, Lagrange, components_of, formulation_of, 
 
 # A user's own system as a model: its numbers by name, its modes, and its components.
 
-#: The further quantities of a mechanical system with a drift or functions of time, and their descriptions.
-BALANCE = {"energy": "energy", "support_power": "power of moving supports"}
+#: The further quantities of a mechanical system with an input, a drift or functions of time, and their descriptions.
+BALANCE = {"energy": "energy", "support_power": "power of moving supports", "input_power": "power of the input"}
 
 
 class OwnModel(AbstractModel):
@@ -61,7 +61,8 @@ class OwnModel(AbstractModel):
         form = Form.of(hybrid, state.size)[0]
         form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
         system = tree["system"]
-        named = {"names": names_of(system, form.size), "has_balance": mechanics.is_driven(system)}
+        has_balance = mechanics.is_driven(system) or tree["input"] is not None
+        named = {"names": names_of(system, form.size, has_balance), "has_balance": has_balance}
         return cls(parameters=Parameters.of(tree), form=form, draw=draw, **named)
 
     def __reduce__(self) -> tuple[Function, tuple[dict[str, Any], Draw]]:
@@ -289,20 +290,19 @@ def assembled(tree: dict[str, Any]) -> tuple[Hybrid, Array]:
         # The states of mechanical systems in it are (q, rate).
         modes = tuple(Lagrange(mode) if isinstance(mode, AbstractSystem) else mode for mode in system.modes)
         return dataclasses.replace(system, modes=modes), state_of(start)
-    formulation = formulation_of(system)
+    formulation = formulation_of(system, tree["input"])
     return Hybrid([formulation], event), formulation.state(start["q"], start["rate"])
 
 
 def _balance_of(
     model: OwnModel, times: Float[Array, "*cells"], states: Float[Array, "*cells components"]
-) -> tuple[Float[Array, "*cells"], Float[Array, "*cells"]]:
+) -> tuple[Float[Array, "*cells"], ...]:
     """The quantities of `BALANCE` at some states. **Arguments:** `model`: with numbers that have the first axes of the times,
     or none."""
 
-    def of_one(t: Array, state: Array, *numbers: Array) -> tuple[Array, Array]:
-        return mechanics.energy_and_support_power(
-            model.parameters.form.tree(numbers)["system"], t, *jnp.split(state, 2)
-        )
+    def of_one(t: Array, state: Array, *numbers: Array) -> tuple[Array, ...]:
+        tree = model.parameters.form.tree(numbers)
+        return mechanics.energy_balance(tree["system"], tree["input"], t, *jnp.split(state, 2))
 
     values, function = model.parameters.values, of_one
     for level in reversed(range(times.ndim)):
@@ -348,10 +348,11 @@ _compiled_parts = eqx.filter_jit(_parts_of_cells)
 def _(
     system: Hybrid | AbstractSystem, start: Any, event: Event | None = None, input: object = None, jumps: object = None
 ) -> OwnModel:
-    if input is not None:
+    if input is not None and not (isinstance(system, AbstractSystem) and mechanics.is_own(system, "input")):
         raise ValueError(
-            f"input = {shown(input)} must be None for your own system: write the input into field(t, y) of a mode or into "
-            "force(t, q, rate) of an AbstractSystem, as numbers or functions of the system"
+            f"input = {shown(input)} must be None for a system without ports: write input(self, q) of an AbstractSystem, whose "
+            "columns are the forces of a unit of each input; or write the input into force(t, q, rate), or into field(t, y) of "
+            "a mode"
         )
     if jumps is not None:
         raise ValueError(
@@ -375,14 +376,32 @@ def _(
             event = with_own_numbers(event, jnp.zeros(()), state)
         if isinstance(system, Hybrid):
             system, event = dataclasses.replace(system, event=event), None
-    return OwnModel.of({"system": system, "start": numbers, "event": event})
+    if input is not None:
+        input = checked_input(input, system)
+    return OwnModel.of({"system": system, "start": numbers, "event": event, "input": input})
+
+
+def checked_input(input: Any, system: AbstractSystem) -> Any:
+    """An input with its own numbers; raises `ValueError` unless it is a function that returns a number for each port."""
+    q = jnp.zeros(system.dimension)
+    ports = jax.eval_shape(system.input, q).shape[1:]
+    wanted = f"a function u(t, q, rate) that returns {counted(ports[0], 'number')}, one for each column of input(q)"
+    if not callable(input):
+        raise ValueError(f"input = {shown(input)} must be {wanted}, or None")
+    arguments = (jnp.zeros(()), q, q)
+    with named_errors("u(t, q, rate)", f"the time t, and the coordinates and rates, arrays of shape {q.shape}"):
+        input = with_own_numbers(input, *arguments)
+        shape = jax.eval_shape(lambda *parts: jnp.atleast_1d(jnp.asarray(input(*parts), float)), *arguments).shape
+    if shape != ports:
+        raise ValueError(f"input = {shown(input)} must be {wanted}, not an array of shape {shape}")
+    return input
 
 
 #: Names of other columns of tables, and of the attributes of a run.
 TAKEN = {"time", "grazes", *dir(Trajectory), *(field.name for field in dataclasses.fields(Trajectory))}
 
 
-def names_of(system: Hybrid | AbstractSystem, size: int) -> tuple[str, ...]:
+def names_of(system: Hybrid | AbstractSystem, size: int, has_balance: bool) -> tuple[str, ...]:
     """The names of the components of a state: those of the system or of its first mode that has some, or `y0` and so on, or
     `q0` and `rate0` and so on for a mechanical system.
 
@@ -398,7 +417,7 @@ def names_of(system: Hybrid | AbstractSystem, size: int) -> tuple[str, ...]:
     size = owner.dimension if has_rates else size
     if (names := owner.names) is None:
         return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(size))
-    words, taken = (), TAKEN.union(BALANCE if mechanics.is_driven(system) else ())
+    words, taken = (), TAKEN.union(BALANCE if has_balance else ())
     if isinstance(names, tuple | list) and all(isinstance(name, str) and name.isidentifier() for name in names):
         words = (*names, *(f"{name}_rate" for name in names if has_rates))
         if len(names) == size and len(set(words)) == len(words) and taken.isdisjoint(words):

@@ -269,9 +269,9 @@ def test_a_wrong_function_is_named(name):
 
 
 @pytest.mark.parametrize(("system", "start"), [(Hybrid([Ball()]), START), (Sleigh(), ([0.0] * 3, [0.0] * 3))])
-def test_an_input_of_one_s_own_system_is_refused(system, start):
+def test_an_input_of_a_system_without_ports_is_refused(system, start):
     message = (
-        r"input = 2\.0 must be None for your own system: write the input into field\(t, y\) of a mode or into force"
+        r"input = 2\.0 must be None for a system without ports: write input\(self, q\) of an AbstractSystem, whose"
     )
     for call in (simulate, event_time):
         with pytest.raises(ValueError, match=message):
