@@ -424,7 +424,8 @@ def event_time(
       units of the magnitudes of the system.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default `nonholonomic.integration.Oscillatory8()`.
     - `crossing`: "first", or "last" for the last fall through zero after which the function stays below zero until `t1`.
-    - `input`: the input of a stroller; `jumps`: times [s] at which the input jumps, as for `stroller.simulate`.
+    - `input`: the input of a stroller; or, for an `AbstractSystem` with ports, a function u(t, q, rate) that returns a number
+      for each of them. `jumps`: times [s] at which the input of a stroller jumps, as for `stroller.simulate`.
 
     **Returns:** the time [s]; infinite if there is no event by `t1` or if the run ends before the event; NaN if the
     integration failed or if resets follow one another without end (more than 2000), with a warning that says so, or if

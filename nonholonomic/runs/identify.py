@@ -57,7 +57,7 @@ class Recording(AbstractRecording):
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`:
       Gaussian.
     - `side`: "before" or "after": the state that a sample at the time of a reset is; a level after a dose is "after".
-    - `input`: the input of a stroller; `jumps`: times [s] at which it jumps, as for `stroller.simulate`.
+    - `input`, `jumps`: the input of a run and the times [s] at which it jumps, as for `event_time`.
 
     **Raises:** `ValueError` for shapes that do not fit.
 
@@ -206,7 +206,7 @@ class EventTimes(AbstractEventTimes):
     - `t1`: horizon [s] of the runs.
     - `event`: a function `event(t, motion)`, whose fall through zero is the event, as for `event_time`; by default the event of
       the system itself.
-    - `input`: the input of a stroller; `jumps`: times [s] at which it jumps, as for `stroller.simulate`.
+    - `input`, `jumps`: the input of a run and the times [s] at which it jumps, as for `event_time`.
     - `until`: time [s] until which you watched a run without the event, a scalar or (n,); `t1` by default.
     - `student`: degrees of freedom, such as 4, of Student's t distribution of the errors, for outliers; `None`: Gaussian.
 

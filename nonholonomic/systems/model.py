@@ -376,7 +376,7 @@ def _(
             event = with_own_numbers(event, jnp.zeros(()), state)
         if isinstance(system, Hybrid):
             system, event = dataclasses.replace(system, event=event), None
-    if input is not None:
+    if input is not None and isinstance(system, AbstractSystem):
         input = checked_input(input, system)
     return OwnModel.of({"system": system, "start": numbers, "event": event, "input": input})
 
