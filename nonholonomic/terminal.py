@@ -125,7 +125,7 @@ class Progress:
             compiling = any(module == compiler and name.startswith(begin) for compiler, begin in COMPILERS)
             frame = frame.f_back
         words = "compiling" if compiling else self._doing
-        if compiling and self._written - self._start > EXPLAINED:
+        if words == "compiling" and self._written - self._start > EXPLAINED:
             often = " (kept on disk)" if getattr(jax.config, "jax_compilation_cache_dir", None) else " and session"
             words += f", usually up to 30 s, once for each kind of call{often}"
         if not self._watched:

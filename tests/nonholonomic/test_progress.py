@@ -58,8 +58,11 @@ def test_a_table_says_what_it_does_within_a_second_and_then_how_fast(monkeypatch
 
 
 def test_a_table_of_one_block_says_so_too(monkeypatch):
+    monkeypatch.setattr(progress_module, "EXPLAINED", 0.7)
     lines = slow_sweep(monkeypatch, Terminal(), cells=3)
-    assert lines[0][1].startswith("compiling")
+    assert lines[0][1].startswith("compiling [")
+    # Also where another thread compiles.
+    assert any(text.startswith("compiling, usually up to 30 s, once for each kind of call") for _, text in lines)
     assert any("0/3" in text for _, text in lines)
 
 
