@@ -180,6 +180,9 @@ class AbstractModel(eqx.Module):
     reduced_names: ClassVar[tuple[str, ...]]
     reduced_start: ClassVar[list[Array]]
 
+    #: The names of those that are angles, to which whole turns may be added.
+    angles: ClassVar[tuple[str, ...]] = ()
+
     @abc.abstractmethod
     def reduced(self, rows: Float[Array, "rows cells"], mode: Int[Array, " cells"]) -> Float[Array, "components cells"]:
         """The reduced states of runs, from the states of their modes."""
@@ -231,6 +234,8 @@ class AbstractSceneModel(AbstractModel):
 
     #: The trees whose numbers are parameters, which are fields of the model.
     roots: ClassVar[dict[str, PyTree]]
+
+    angles = ("azimuth", "eta", "mu", "heading")
 
     @property
     def known_of_event(self) -> list[str]:

@@ -19,6 +19,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..compilation.tracing import named_errors, with_own_numbers
 from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, tangent_scale, tangents_by
+from ..geometry.vector import nearest_turn
 from ..hybrid import solve_hybrid
 from ..hybrid.saltation import VariationalMode, along, delay, variational_modes, variational_start
 from ..integration import Settings
@@ -127,8 +128,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
 
     def for_parts(self, wanted: tuple[int, ...]) -> "OrbitSolve":
         # The real and the imaginary parts of the multipliers.
-        is_wanted = any(part % PARTS in (2, 3) for part in wanted if part >= PARTS)
-        return dataclasses.replace(self, with_multipliers=is_wanted)
+        return dataclasses.replace(self, with_multipliers=any(k % PARTS in (2, 3) for k in wanted if k >= PARTS))
 
     def model(self, leaves: Sequence[Array]) -> AbstractModel:
         """The model of the leaves."""
@@ -150,11 +150,13 @@ class OrbitSolve(AbstractDifferentiableSolve):
         """States of the engine in the components of a start, (components, cells), by default mapped by the symmetry."""
         model = self.model(leaves)
         state = model.reduced(rows, mode)
-        if model.symmetry is None or not mapped:
-            return state
-        form, values = model.symmetry.form, model.symmetry.values
-        axes = tuple(0 if jnp.ndim(value) else None for value in values)
-        return jax.vmap(lambda state, *values: form.tree(values)["symmetry"](state), (-1, *axes), -1)(state, *values)
+        if model.symmetry is not None and mapped:
+            form, values = model.symmetry.form, model.symmetry.values
+            axes = tuple(0 if jnp.ndim(value) else None for value in values)
+            symmetric = jax.vmap(lambda state, *values: form.tree(values)["symmetry"](state), (-1, *axes), -1)
+            state = symmetric(state, *values)
+        near = zip(model.reduced_names, state, model.reduced_start, strict=True)
+        return jnp.stack([nearest_turn(part, start) if name in model.angles else part for name, part, start in near])
 
     def at_section(self, mode: VariationalMode, state: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """By how much runs in a mode end before the section [s], and the states at the section, with their variations."""

@@ -18,7 +18,6 @@ from nonholonomic import identification
 from nonholonomic.compilation.components import Held
 from nonholonomic.compilation.tracing import dependent_outputs
 from nonholonomic.geometry import Cylinder, Plane
-from nonholonomic.geometry.vector import nearest_turn
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractProblem, Outcome
 from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_run
@@ -193,8 +192,7 @@ class RideModel(AbstractSceneModel):
         """Whether the input depends on some of its arguments, the time `t` and the parts of the motion."""
         if self.input is None:
             return False
-        shapes = eqx.filter_eval_shape(at_start, self.scene, self.launch)
-        t, motion = jax.tree.map(lambda part: jnp.zeros(()), shapes)
+        t, motion = jax.tree.map(lambda part: jnp.zeros(()), eqx.filter_eval_shape(at_start, self.scene, self.launch))
         values = {"t": t, **motion._asdict()}
 
         def returned(moved: dict[str, PyTree]) -> PyTree:
@@ -231,15 +229,12 @@ class RideModel(AbstractSceneModel):
         return dataclasses.replace(self, launch=launch, input=controls)
 
     def reduced(self, rows: Float[Array, "rows cells"], mode: object) -> Float[Array, "components cells"]:
-        coordinates, place = self.scene.surface.coordinates, self.launch.place
+        coordinates = self.scene.surface.coordinates
         values = self.read(("place", *OF_A_LAUNCH), jnp.asarray(jnp.nan), rows, None)
         values |= zip((name for name, _ in coordinates), jnp.moveaxis(values.pop("place"), -1, 0), strict=True)
         if self.scene.heading == "projected" and "mu" in values and "mu" not in self.reduced_names:
             # This angle is that from the fixed x axis, which does not turn with the place.
             values["heading"] = values["heading"] - values["mu"]
-        angles = zip(coordinates, place, strict=True) if len(place) == len(coordinates) else ()
-        near = {"heading": self.launch.heading} | {name: angle for (name, unit), angle in angles if unit == "rad"}
-        values |= {name: nearest_turn(values[name], angle) for name, angle in near.items()}
         return jnp.stack([values[name] for name in self.reduced_names])
 
     def without_event(self) -> "RideModel":

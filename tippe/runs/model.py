@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Cylinder, Plane, Sphere, cross, scale, sum_vectors
 from nonholonomic.geometry.frames import CarriedFrame
-from nonholonomic.geometry.vector import nearest_turn, planar_length
+from nonholonomic.geometry.vector import planar_length
 from nonholonomic.hybrid import BETWEEN, AbstractBatchedMode, HybridOutcome
 from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome
 from nonholonomic.integration.problem import FAILED, Status
@@ -301,7 +301,7 @@ class TopModel(AbstractSceneModel):
         return dataclasses.replace(self, launch=launch, first=None if self.smooth else first[0])
 
     def reduced(self, rows: Float[Array, "rows cells"], mode: Int[Array, " cells"]) -> Float[Array, "components cells"]:
-        scene, launch = self.scene, self.launch
+        scene = self.scene
         inside, is_rigid = -scene.surface.sign(scene.side, "inside"), isinstance(scene.body, AbstractRigidBody)
         state = rows[: 8 + len(scene.frame.lengths) + 3 * is_rigid]
         if scene.friction.set_valued:
@@ -322,12 +322,13 @@ class TopModel(AbstractSceneModel):
         (x, y), *others = (
             (cosine * part[0] + sine * part[1], cosine * part[1] - sine * part[0], *part[2:]) for part in (e[:2], u, w)
         )
-        azimuth = nearest_turn(jnp.arctan2(y, x), launch.azimuth)
-        values = {"theta": inclination(e), "azimuth": azimuth} | dict(zip(LABELS, sum(others, ()), strict=True))
+        values = {"theta": inclination(e), "azimuth": jnp.arctan2(y, x)} | dict(
+            zip(LABELS, sum(others, ()), strict=True)
+        )
         if isinstance(scene.surface, Sphere):
             values["eta"] = jnp.arctan2(planar_length(place[0], place[1]), inside * place[2])
         elif isinstance(scene.surface, Cylinder):
-            values["eta"] = nearest_turn(jnp.arctan2(inside * place[0], inside * place[1]), launch.eta)
+            values["eta"] = jnp.arctan2(inside * place[0], inside * place[1])
         return jnp.stack([values[name] for name in self.reduced_names])
 
     @property

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from models import CART
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from tops import rutstam_top
 
@@ -145,9 +146,78 @@ def test_derivatives_of_a_nutation_by_numbers():
     np.testing.assert_allclose(slopes, [by_offset, by_spin], rtol=1e-6)
 
 
+def rocks(t, motion):
+    return motion.theta_rate
+
+
+@pytest.mark.slow
+def test_an_ellipsoid_that_rocks():
+    """In the plane across its long axis, (I + m r^2) theta'^2 / 2 + m g h is constant, with the distance r of the centre of
+    mass from the contact and its height h. Half a period later the body leans to the other side."""
+    inertia, amplitude, gravity = 2e-4, 0.1, 9.81
+    body = tippe.Ellipsoid(1.0, (0.2, 0.03, 0.02), (0.0, 0.0, -0.01), np.diag([inertia, 1.6e-3, 1.7e-3]))
+    scene = tippe.Scene(body, friction=tippe.NoSlip())
+
+    def other_side(state):
+        return state.at[1].add(-jnp.pi)
+
+    launch = tippe.Launch(amplitude, 0.0, azimuth=0.5 * np.pi)
+    orbit = periodic_orbit(scene, launch, rocks, symmetry=other_side)
+
+    def height(angle):
+        return np.hypot(0.03 * np.sin(angle), 0.02 * np.cos(angle)) - 0.01 * np.cos(angle)
+
+    angle = amplitude * np.sin(0.5 * np.pi * (np.arange(200) + 0.5) / 200.0)
+    normal = np.stack([np.sin(angle), np.cos(angle)])
+    squares = np.array([[0.03**2], [0.02**2]])
+    lever = squares * normal / np.sqrt(np.sum(squares * normal**2, axis=0)) - np.array([[0.0], [0.01]])
+    rate = np.sqrt(2.0 * gravity * (height(amplitude) - height(angle)) / (inertia + np.sum(lever**2, axis=0)))
+    half = 2.0 * np.sum(np.sqrt(amplitude**2 - angle**2) / rate) * 0.5 * np.pi / 200.0
+    np.testing.assert_allclose(orbit.period, half, rtol=1e-10)
+    np.testing.assert_allclose(orbit.state[:2], [amplitude, 0.5 * np.pi], atol=1e-9)
+    assert orbit.names[:3] == ("theta", "azimuth", "angular_velocity_t1")
+
+
+def middle(t, motion):
+    return motion.velocity[0]
+
+
+@pytest.mark.slow
+def test_a_top_that_swings_in_a_cylinder():
+    """A double pendulum in the plane: the angles eta of the centre and psi of the axis, from the vertical."""
+    top = rutstam_top()
+    mass, a, I1, g, rho = (float(x) for x in (top.mass, top.offset, top.I1, 9.81, 0.3 - float(top.radius)))
+    launch = tippe.Launch(0.0285, 0.0, eta=0.3, azimuth=np.pi)
+    orbit = periodic_orbit(tippe.Scene(top, tippe.Cylinder(0.3)), launch, middle)
+    theta, eta, azimuth = (float(x) for x in orbit.state[:3])
+    assert abs(eta - 0.3) < 0.1
+    np.testing.assert_allclose(np.cos(azimuth), -1.0, atol=1e-8)
+    np.testing.assert_allclose(orbit.state[3:], 0.0, atol=1e-6)
+
+    def field(t, y):
+        eta, psi, eta_rate, psi_rate = y
+        c, s = np.cos(psi - eta), np.sin(psi - eta)
+        matrix = mass * np.array([[rho**2, rho * a * c], [rho * a * c, a**2 + I1 / mass]])
+        force = mass * np.array(
+            [rho * a * s * psi_rate**2 - g * rho * np.sin(eta), -rho * a * s * eta_rate**2 - g * a * np.sin(psi)]
+        )
+        return [eta_rate, psi_rate, *np.linalg.solve(matrix, force)]
+
+    start = [eta, eta + theta, 0.0, 0.0]
+    end = solve_ivp(field, (0.0, float(orbit.period)), start, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    np.testing.assert_allclose(end, start, atol=1e-7)
+
+
 def test_what_is_no_orbit_of_a_scene():
     scene = tippe.Scene(rutstam_top())
     launch = tippe.Launch(0.5, 100.0)
+    motion = tippe.steady.tumbling(scene, 1.0)
+    about_axis = motion.spin - motion.precession * np.cos(1.0)
+    steady = tippe.Launch(1.0, about_axis, angular_velocity=(0.0, 0.0, motion.precession))
+    with pytest.raises(
+        ValueError, match=r"is an equilibrium; a steady motion is no orbit, and tippe\.steady has those"
+    ):
+        periodic_orbit(scene, steady, turns_back)
     with pytest.raises(ValueError, match="the section of a scene needs event="):
         periodic_orbit(scene, launch)
     with pytest.raises(ValueError, match="are found on planes, cylinders and spheres"):
