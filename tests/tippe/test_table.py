@@ -72,7 +72,9 @@ def test_a_table_takes_a_launch(rutstam_scene_module):
     np.testing.assert_array_equal(table.end_theta, in_radians.end_theta)
     assert "end_theta [deg]" in repr(table)
     assert "end_theta [rad]" in repr(in_radians)
-    with pytest.raises(ValueError, match="launch must be left out where its numbers are given"):
+    with pytest.raises(
+        ValueError, match=r"launch must be left out where its numbers are given; or pass these by axes=\{.*: \[\.\.\.\]"
+    ):
         tippe.inversion_table(rutstam_scene_module, launch, theta=0.1, **arguments)
     with pytest.raises(ValueError, match="spin = None is not a number: pass a launch"):
         tippe.inversion_table(rutstam_scene_module, theta=0.1, **arguments)

@@ -208,8 +208,9 @@ def launches(
     stated, launch_values = launch_values.get("launch"), {k: v for k, v in launch_values.items() if k != "launch"}
     if stated is not None:
         require_kind(stated, "launch", Launch, several="scattered=True takes lists of their numbers, by name")
-        if any(np.any(value) for name, value in launch_values.items() if name != "mu"):
-            raise ValueError("launch must be left out where its numbers are given")
+        if doubled := [name for name, value in launch_values.items() if name != "mu" and np.any(value)]:
+            given = ", ".join(f"'{name}': [...]" for name in doubled)
+            raise ValueError(f"launch must be left out where its numbers are given; or pass these by axes={{{given}}}")
         own = {name for name in launch_values if f"launch.{name}" not in axes}
         launch_values = {name: getattr(stated, name, value) for name, value in launch_values.items() if name in own}
         others = {name: value for name, value in numbers("launch", stated).items() if value is not None}
