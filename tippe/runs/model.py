@@ -274,11 +274,11 @@ class TopModel(AbstractSceneModel):
 
     @property
     def reduced_names(self) -> tuple[str, ...]:
-        scene = self.scene
+        scene, law, is_rigid = self.scene, self.scene.friction, isinstance(self.scene.body, AbstractRigidBody)
         # A body of revolution that leans in another direction is the same, where all directions are alike.
-        is_shifted = scene.level and scene.friction.isotropic and not isinstance(scene.body, AbstractRigidBody)
+        is_shifted = scene.level and (law.isotropic or law.set_valued) and not is_rigid
         place = ("eta",) * isinstance(scene.surface, Cylinder | Sphere) + ("azimuth",) * (not is_shifted)
-        return ("theta", *place, *(() if isinstance(scene.friction, NoSlip) else LABELS[:2]), *LABELS[2:])
+        return ("theta", *place, *(() if isinstance(law, NoSlip) else LABELS[:2]), *LABELS[2:])
 
     @property
     def reduced_start(self) -> list[Array]:
