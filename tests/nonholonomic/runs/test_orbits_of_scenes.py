@@ -132,6 +132,16 @@ def test_derivatives_of_a_stroller_by_numbers():
 
 
 @pytest.mark.slow
+def test_several_launches_lead_to_one_orbit():
+    scene = stroller.Scene(SPRUNG, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    launches = [stroller.Launch((0.0, 0.0), 0.0, speed) for speed in (1.0, 1.3)]
+    (orbit,) = periodic_orbit(scene, launches, period=2.0, input=Shaken(4.0))
+    np.testing.assert_allclose(orbit.state, ride(4.0).state, rtol=1e-9)
+    batch = jax.jit(jax.vmap(lambda force: ride(force).state))(jnp.array([4.0, 5.0]))
+    np.testing.assert_allclose(batch, [ride(4.0).state, ride(5.0).state], rtol=1e-9)
+
+
+@pytest.mark.slow
 def test_derivatives_of_a_nutation_by_numbers():
     def period(offset, spin):
         top = eqx.tree_at(lambda top: top.offset, rutstam_top(), offset)
