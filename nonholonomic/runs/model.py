@@ -236,6 +236,7 @@ class AbstractSceneModel(AbstractModel):
     roots: ClassVar[dict[str, PyTree]]
 
     angles = ("azimuth", "eta", "mu", "heading")
+    at_rest = "; a steady motion is no orbit, and tippe.steady has those of tops"
 
     @property
     def known_of_event(self) -> list[str]:

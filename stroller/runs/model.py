@@ -182,8 +182,6 @@ class RideModel(AbstractSceneModel):
         # The state ends with the time if a quantity depends on the input.
         return ride if self.input is None or names is None or TIMED.isdisjoint(names) else with_clock(ride)
 
-    at_rest = "; steady circles and straight rides are no orbits"
-
     @property
     def depends_on_time(self) -> bool:
         return super().depends_on_time or self._reads("t")

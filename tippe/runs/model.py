@@ -270,8 +270,6 @@ class TopModel(AbstractSceneModel):
                 "second derivatives do not exist through changes of mode: contact = 'hybrid', SetValuedCoulomb"
             )
 
-    at_rest = "; a steady motion is no orbit, and tippe.steady has those of tops"
-
     @property
     def reduced_names(self) -> tuple[str, ...]:
         scene, law, is_rigid = self.scene, self.scene.friction, isinstance(self.scene.body, AbstractRigidBody)
@@ -292,6 +290,7 @@ class TopModel(AbstractSceneModel):
         if isinstance(scene.frame, CarriedFrame) or (isinstance(scene.body, AbstractRigidBody) and not scene.level):
             place = "a level plane for this body" if scene.contact == "stop" else "contact = 'stop'"
             raise ValueError(f"system: periodic motions are found on planes, cylinders and spheres; choose {place}")
+        Bound(self.launch.theta, "theta", above=0.0, below=math.pi, why="the axis must lean on the section").require()
         first = jnp.zeros(1, int) if self.smooth else self.modes(1, jnp.asarray(1e-9), self.comparable, False)[1]
         state = self.reduced(scene.state(self.launch)[:, None], first)[:, 0]
         values = dict(zip(self.reduced_names, state, strict=True))

@@ -243,6 +243,8 @@ def test_what_is_no_orbit_of_a_scene():
         ValueError, match=r"is an equilibrium; a steady motion is no orbit, and tippe\.steady has those"
     ):
         periodic_orbit(scene, steady, turns_back)
+    with pytest.raises(ValueError, match=r"theta = 0\.0 must be greater than 0\.0 \(the axis must lean"):
+        periodic_orbit(scene, tippe.Launch(0.0, 100.0), turns_back)
     with pytest.raises(ValueError, match="the section of a scene needs event="):
         periodic_orbit(scene, launch)
     with pytest.raises(ValueError, match="are found on planes, cylinders and spheres"):
