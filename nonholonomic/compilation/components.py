@@ -201,6 +201,14 @@ class Evaluation(AbstractScalarReader):
             elements[index] = constants[index]
         return elements
 
+    def apply(self, equation: Equation, inputs: list[Elements]) -> Sequence[Elements] | Program:
+        if equation.primitive.name == "dot_general":
+            # The factors may be of different types, such as a matrix of whole numbers and a state.
+            kind = equation.outvars[0].aval.dtype
+            convert = np.frompyfunc(lambda number: number if number.dtype == kind else number.astype(kind), 1, 1)
+            inputs = [convert(value) for value in inputs]
+        return super().apply(equation, inputs)
+
     def kind(self, equation: Equation) -> str:
         if equation.primitive.name not in BY_ELEMENT.split():
             raise TooLarge(equation.primitive.name)

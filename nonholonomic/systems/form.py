@@ -204,11 +204,17 @@ class Form:
         def results(functions: list[OfRun], t: Array, y: State, *numbers: Array) -> list[PyTree]:
             return [function(numbers, t, y) for function in functions]
 
+        def energies(numbers: Sequence[Array], t: Array, y: State) -> list[Array]:
+            # The potential may depend on time where the forces do not.
+            modes = [mode for mode in self.tree.tree(numbers).modes if isinstance(mode, AbstractFormulation)]
+            driven = (mode for mode in modes if mechanics.is_driven(mode.system))
+            return [mechanics.at_time(mode.system, t).energy(*mode.split(y)) for mode in driven]
+
         def warned(numbers: Sequence[Array]) -> None:
             for name, k in within_steps:
                 warn_of_unclear(_name(name.rstrip("s"), k), functools.partial(self.function(name, k), numbers), y)
 
-        everything = functools.partial(results, [*functions, *reset_functions])
+        everything = functools.partial(results, [*functions, *reset_functions, energies])
         depends_on_time = any(dependent_outputs(everything, t, y, *numbers, on_first_alone=True))
         if depends_on_time:
             jax.eval_shape(warned, numbers)
@@ -394,7 +400,10 @@ def _check_functions(form: Form, prefix: str, names: tuple[str, ...]) -> None:
         "lagrangian": ("one number", lambda shape: shape == ()),
         "frame": (f"of shape ({n}, {n})", lambda shape: shape == (n, n)),
         "force": (f"of shape ({n},)", lambda shape: shape in ((), (1,), (n,))),
-        "input": (f"of shape ({n}, ports), a column for each port", lambda shape: len(shape) == 2 and shape[0] == n),
+        "input": (
+            f"of shape ({n}, ports), a column for each port",
+            lambda shape: shape is not None and shape[:1] == (n,) and len(shape) == 2,
+        ),
         "margin": (
             "one number, an array of shape (k,), a dict of numbers by name, or None",
             lambda shape: shape is None or (shape != "" and (set(shape) == {()} or len(shape) < 2)),
@@ -424,6 +433,8 @@ def _check_functions(form: Form, prefix: str, names: tuple[str, ...]) -> None:
             break  # Nothing calls the reset.
         if not fits(shape):
             raise ValueError(f"{prefix}{name} must be {expected_shape}, not {shown(result) if shape == '' else shape}")
+        if method in (*mechanics.TIMED, "frame") and not jnp.issubdtype(result.dtype, jnp.floating):
+            raise ValueError(f"{prefix}{name} must return floats, not {result.dtype}: write 1.0 instead of 1")
 
 
 def _shape_of(result: Any) -> Any:

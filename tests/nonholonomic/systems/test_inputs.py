@@ -72,6 +72,29 @@ def test_gains_are_swept_differentiated_and_fitted():
     assert fit.estimates["input.gain"] == pytest.approx(1.5, abs=0.01)
 
 
+class Ported(Cart):
+    """A cart whose ports are given by the test."""
+
+    ports: object = eqx.field(static=True, default=None)
+
+    def input(self, q):
+        return self.ports and jnp.array(self.ports)
+
+
+def test_ports_and_inputs_of_whole_numbers():
+    """As a user writes them: the product of numbers of two types is taken in floats."""
+    run = simulate(Ported(ports=((1,),)), REST, 3.0, times=[3.0], input=lambda t, q, rate: (3,))
+    np.testing.assert_allclose(run["x_rate"], 6.0 * (1.0 - np.exp(-0.75)), rtol=1e-7)
+
+
+@pytest.mark.parametrize(("ports", "message"), [(None, "not None"), ((1.0,), r"not \(1,\)")], ids=["none", "vector"])
+def test_ports_of_a_wrong_shape(ports, message):
+    with pytest.raises(
+        ValueError, match=r"input\(q\) must be of shape \(1, ports\), a column for each port, " + message
+    ):
+        simulate(Ported(ports=ports), REST, 1.0, input=lambda t, q, rate: 1.0)
+
+
 def test_a_short_pulse_is_not_missed():
     def pulse(t, q, rate):
         return jnp.where((t > 1.0) & (t < 1.01), 100.0, 0.0)

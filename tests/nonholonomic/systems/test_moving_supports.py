@@ -331,6 +331,30 @@ def test_a_driven_mass_follows_the_closed_form_in_a_table():
     assert_close(table["support_power"], power, rtol=1e-8)
 
 
+class Lift(AbstractSystem):
+    """A falling mass, by its height above a lift that rises at a speed: its weight does not depend on time."""
+
+    speed: float = 2.0
+    dimension = 1
+
+    def metric(self, q):
+        return jnp.eye(1)
+
+    def lagrangian(self, t, q, rate):
+        return 0.5 * (rate[0] + self.speed) ** 2 - GRAVITY * (q[0] + self.speed * t)
+
+
+def test_the_energy_in_a_table_where_only_the_energy_depends_on_time():
+    """E = q' dL/dq' - L, with q' = -g t and q = 1 - g t^2 / 2."""
+    times, speeds = np.array([0.5, 1.0]), np.array([[1.0], [2.0]])
+    options = {"times": times, "quantities": ["energy", "support_power"], "progress": False}
+    table = sweep(Lift(), ([1.0], [0.0]), 1.0, axes={"speed": speeds[:, 0]}, **options)
+    rate, height = -GRAVITY * times, 1.0 - 0.5 * GRAVITY * times**2 + speeds * times
+    energy = (rate + speeds) * rate - 0.5 * (rate + speeds) ** 2 + GRAVITY * height
+    assert_close(table["energy"], energy, rtol=1e-8)
+    assert_close(table["support_power"], GRAVITY * speeds + 0.0 * times, rtol=1e-8)
+
+
 def test_constraints_that_depend_on_time_turn_the_velocity():
     """With a blade that turns at 0.7 rad/s, the velocity keeps its magnitude and turns, as no force acts along it."""
     t, speed = 0.4, 2.0
@@ -398,6 +422,10 @@ WRONG = {
     "a metric that is a vector": (
         lambda: replaced(Sleigh, metric=lambda self, t, q: q),
         r"^metric\(t, q\) must be of shape \(3, 3\), not \(3,\)",
+    ),
+    "constraints of whole numbers": (
+        lambda: replaced(Sleigh, constraints=lambda self, q: jnp.array([[0, 1, 0]])),
+        r"^constraints\(q\) must return floats, not int64: write 1\.0 instead of 1",
     ),
     "a frame with a drift": (
         lambda: replaced(Sleigh, drift=lambda self, q: jnp.ones(1), frame=lambda self, q: jnp.eye(3)),
