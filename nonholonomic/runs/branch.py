@@ -55,6 +55,7 @@ REASONS = (
     "the integration of the run from there fails",
     "a reset of the run from there is grazing, and the return map has no derivative",
     "a reset falls on the end of the period; shift the phase of the drive",
+    "the drive does not repeat after the period; pass period=, that of the drive, in s",
     "a number is illegal",
 )
 
@@ -181,7 +182,7 @@ class Orbit(eqx.Module):
             f"error below {float(self.error):.1g}, Newton steps {int(self.iterations)}",
         ]
         if int(self.family):
-            lines.append(f"one of a family of orbits, in {int(self.family)} direction(s)")
+            lines.append(f"one of a family of orbits, in {counted(int(self.family), 'direction')}")
         return "\n  ".join(lines)
 
 
@@ -449,6 +450,11 @@ def continuation_of(
     largest = float(np.abs(np.asarray(orbit.state)).max())
     scale = largest if largest > SMALLEST_SCALE else 1.0
     course = Continuation(orbit, others, period, first, float(until), scale, orbit.returns)
+    if search.is_driven and model.symmetry is None and not course.repeats():
+        raise ValueError(
+            f"period: where {name} = {until:.10g}, the drive does not repeat after "
+            f"{'this period' if period else 'that of the orbit'}; pass period=, that of the drive as a function of the number"
+        )
     new = course.evaluated(course.begin)
     return course._replace(in_motion=bool(new.in_motion)), full
 
@@ -467,8 +473,6 @@ def branch_of(
     if step is not None:
         require(step, "step", above=0.0)
     course, full = continuation_of(orbit, name, until, period)
-    span = abs(course.last - course.first)
-    largest = 1.0 / STEPS if step is None else min(float(step) / span, 0.5)
+    largest = 1.0 / STEPS if step is None else min(float(step) / abs(course.last - course.first), 0.5)
     found, kinds, end = course.followed(largest, points)
-    values = jnp.asarray([point.value for point in found])
-    return Branch(full, values, course.orbits(found), tuple(kinds), end, period)
+    return Branch(full, jnp.asarray([point.value for point in found]), course.orbits(found), tuple(kinds), end, period)

@@ -65,6 +65,9 @@ OF_A_FAMILY = (
 #: Singular values below this, as a part of the largest, are round-off.
 ROUND_OFF = 1e-10
 
+#: Orbits whose periods and states differ by less than this are the same, as are returns after two periods and a double one.
+SAME_ORBIT = 1e-6
+
 #: A state this near the section, in units of the time of a return, is moved onto it.
 NEAR = 0.05
 
@@ -205,8 +208,17 @@ class Continuation(NamedTuple):
         parts = jax.tree.map(jnp.asarray, (*numbers, *counts)), tuple(map(jnp.asarray, leaves))
         return type(self.orbit)(*parts[0], self.orbit.names, parts[1], search, self.returns)
 
-    def evaluated(self, unknowns: np.ndarray) -> Returns:
-        """The returns from a state, for a value of the number."""
+    def repeats(self) -> bool:
+        """Whether a drive repeats after its period at the last value of the number: unless two periods from the orbit lead
+        elsewhere than one of twice the length."""
+        unknowns = np.append(self.begin[:-1], self.last / (self.last - self.first))
+        once, twice = self.evaluated(unknowns, 2), self._replace(returns=2 * self.returns).evaluated(unknowns)
+        distance, growth = np.abs(once.state - twice.state).max(), max(1.0, np.abs(twice.by_state).max())
+        same = SAME_ORBIT * growth * max(self.scale, np.abs(twice.state).max())
+        return bool(once.reason or twice.reason or distance <= same)
+
+    def evaluated(self, unknowns: np.ndarray, periods: int = 1) -> Returns:
+        """The returns from a state, for a value of the number. **Arguments:** `periods`: of the drive, in a return."""
         search, value = self.orbit.search, unknowns[-1] * (self.last - self.first)
         leaves, rate = [np.asarray(leaf) for leaf in self.orbit.leaves], 0.0
         for k in self.others:
@@ -214,6 +226,7 @@ class Continuation(NamedTuple):
         if self.period is not None:
             horizon, slope = jax.jvp(self.period, (jnp.asarray(value),), (jnp.ones(()),))
             leaves[0], rate = np.asarray(horizon), float(slope)
+        leaves[0] = leaves[0] * float(periods)
         state, tolerance = np.array(self.orbit.state), max(float(leaves[-1]) / FINER, TIGHTEST)
         state[list(search.free)] = unknowns[:-1] * self.scale
         time = float(self.orbit.period) / self.orbit.returns

@@ -29,7 +29,7 @@ from ..terminal import status_line
 from ..text import described, shown
 from ..validation import as_number, explaining, is_traced, require_outside
 from .branch import REASONS, Orbit
-from .continuation import FINER, NEAR, RANK
+from .continuation import FINER, NEAR, RANK, SAME_ORBIT
 from .crossings import SAME, on_margin, require_section, section_of
 from .event import Ensemble, EventTime, modes_of
 from .model import AbstractModel, check_run, model_of, settings_for_lanes
@@ -42,9 +42,6 @@ STENCIL, STENCIL_STEP = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0)), 1e
 
 #: Ratio of the error bound to the last Newton step.
 SAFETY = 5.0
-
-#: Orbits whose periods and states differ by less than this are the same.
-SAME_ORBIT = 1e-6
 
 #: The number of parts of an orbit.
 PARTS = 9
@@ -74,8 +71,9 @@ class Return(NamedTuple):
 class Newton(NamedTuple):
     """The state of Newton's iteration, and its last return.
 
-    - `count`: number of returns so far; `state`: (components, cells); `is_done`, `is_finished`: whether all cells have
-      converged, also at the finer tolerance; `reason`: as for `Orbit`, where the search has been given up; `iterations`.
+    - `count`: number of returns so far; `state`: (components, cells); `is_done`, `is_fine`: whether all cells have converged,
+      also at the finer tolerance; `is_finished`: whether also the drive has been checked; `reason`: as for `Orbit`, where the
+      search has been given up; `iterations`.
     - `in_motion`, `time`, `by_state`, `time_by_state`: of the last return; `inverse`: of 1 - J.
     - `residual`, `step`: by how much the last return missed, and the length of the last step.
     """
@@ -83,6 +81,7 @@ class Newton(NamedTuple):
     count: Array
     state: Array
     is_done: Array
+    is_fine: Array
     is_finished: Array
     reason: Array
     iterations: Array
@@ -277,13 +276,16 @@ class OrbitSolve(AbstractDifferentiableSolve):
             state = self.components(moved, states, first, mapped=False)
         return state, total, falls
 
-    def newton(self, cells: int, leaves: tuple[Array, ...]) -> Newton:
-        """Newton's iteration of all cells, from the starts."""
+    def newton(self, cells: int, leaves: tuple[Array, ...], repeats: bool = True) -> Newton:
+        """Newton's iteration of all cells, from the starts. **Arguments:** `repeats`: whether a drive should repeat."""
         is_legal, t1, settings = self.event.permitted(self.of_event(leaves))
         tolerance = settings.tolerance
         finer = jnp.maximum(tolerance / FINER, TIGHTEST)
         size, free = len(self.starts), jnp.asarray(self.free)
         start = jnp.stack([jnp.broadcast_to(leaves[k], (cells,)) for k in self.starts])
+        is_timed = self.is_driven and self.model(leaves).depends_on_time
+        # A symmetry may map a drive to that of the next period.
+        is_checked = repeats and is_timed and self.model(leaves).symmetry is None
 
         def step(old: Newton) -> Newton:
             is_bad, state = old.reason > 0, old.state
@@ -291,7 +293,8 @@ class OrbitSolve(AbstractDifferentiableSolve):
             moved, shift, falls = self.on_section(leaves, cells, state)
             is_near = falls & (jnp.abs(shift) < NEAR * old.time)
             state = jnp.where(old.in_motion & is_near & ~is_bad, moved, state)
-            left = jnp.where(is_bad, 0.0, t1)
+            verifies = old.is_fine & is_checked
+            left = jnp.where(is_bad, 0.0, jnp.where(verifies, 2.0 * t1, t1))
             new = self.returned(self.with_start(leaves, state), cells, (), tolerance_now, left)
             miss = new.state - state
             matrix = (jnp.eye(size) - new.by_state)[:, :, free]
@@ -313,15 +316,20 @@ class OrbitSolve(AbstractDifferentiableSolve):
             converged = residual <= CONVERGED * tolerance * scale
             converged &= ~settles & (length <= jnp.sqrt(tolerance) * scale)
             rests = extent <= CONVERGED * tolerance * jnp.maximum(scale, jnp.max(jnp.abs(start), axis=0))
-            rests &= new.in_motion & (not self.is_driven)
+            rests &= new.in_motion & (not is_timed)
             misses = ~is_sound | (~converged & (old.count >= MOST_NEWTON))
             reason = jnp.select([is_bad, new.reason > 0, rests, misses], [old.reason, new.reason, 4, 3], 0)
             following = jnp.where(settles, settled, state + change)
-            return Newton(
+            # An orbit also returns after two periods, unless the drive has another one.
+            growth = jnp.maximum(1.0, jnp.max(jnp.abs(new.by_state), axis=(1, 2)))
+            is_same = (new.reason == 0) & (residual <= (SAME_ORBIT + CONVERGED * tolerance) * scale * growth)
+            checked = old._replace(is_finished=verifies, reason=jnp.where(is_bad | is_same, old.reason, 9))
+            corrected = Newton(
                 old.count + 1,
                 jnp.where(reason > 0, state, following),
                 jnp.all(converged | (reason > 0)),
                 old.is_done,
+                old.is_done & (not is_checked),
                 reason,
                 old.iterations + (reason == 0),
                 new.in_motion,
@@ -332,12 +340,13 @@ class OrbitSolve(AbstractDifferentiableSolve):
                 jnp.where(is_bad, old.residual, residual),
                 length,
             )
+            return jax.tree.map(lambda old, new: jnp.where(verifies, old, new), checked, corrected)
 
         false, zeros, whole = jnp.asarray(False), jnp.zeros(cells), jnp.zeros(cells, int)
         reason = jnp.where(is_legal, whole, len(REASONS) - 1)
         matrices = (jnp.zeros((cells, size, size)), jnp.zeros((cells, size)), jnp.zeros((cells, len(self.free), size)))
         of_last = (jnp.zeros(cells, bool), zeros, *matrices, zeros, zeros)
-        begin = Newton(jnp.zeros((), int), start, false, false, reason, whole, *of_last)
+        begin = Newton(jnp.zeros((), int), start, false, false, false, reason, whole, *of_last)
         return jax.lax.while_loop(lambda newton: ~newton.is_finished, step, begin)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> tuple[Array, ...]:
@@ -411,7 +420,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
                 steps = [place * size * by for place, _ in STENCIL]
                 blocks = blocks.at[row].add(jnp.stack([jnp.broadcast_to(step, (cells,)) for step in steps]))
             moved.append(blocks.reshape(-1))
-        parts = self.parts_of(self.newton(count * cells, tuple(moved)))
+        parts = self.parts_of(self.newton(count * cells, tuple(moved), repeats=False))
         near = (parts[2] + 1j * parts[3]).reshape(len(active), len(STENCIL), cells, -1)
         # The multipliers in the order of those of the orbit.
         places = jnp.argmin(jnp.abs(near[..., None, :] - values[:, :, None]), axis=-1)
@@ -490,7 +499,7 @@ def periodic_orbit(
     - `start`: a guess of a state on the orbit, near the section, in the first mode, or a launch. Several guesses have the shape
       (guesses, components), or twice (guesses, coordinates) for an `AbstractSystem`, or are a list of launches.
     - `event`, `direction`: the section, as for `crossings`; by default the event of the `Hybrid`. A scene needs an `event`.
-    - `period`: the period [s] of a driven system, in place of a section. The drive begins at time 0.
+    - `period`: the period [s] of a driven system, in place of a section. The drive begins at time 0, and repeats after it.
     - `free`: names of the components that Newton's method changes, such as `["y0"]`; by default all. The others must be
       those of an orbit: a guess that is off the section is moved onto it only if all are free.
     - `symmetry`: function of the state at a return that maps it to the start of the next period, for orbits that repeat up to a

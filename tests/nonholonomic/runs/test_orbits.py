@@ -151,6 +151,19 @@ def test_a_driven_oscillator_and_its_derivatives_by_the_frequency():
         assert np.all(errors <= rough.error)
         assert rough.error < 1e3 * tolerance
     np.testing.assert_allclose(slopes, jax.jacfwd(exact)(1.3), atol=1e-8)
+    # Half of the drive's period, or a period that does not follow the frequency.
+    system, period = Hybrid([Driven(0.2, 1.3)]), 2.0 * np.pi / 1.3
+    with pytest.raises(ValueError, match="the drive does not repeat after the period; pass period=, that of the drive"):
+        periodic_orbit(system, [0.0, 0.0], period=0.5 * period)
+    driven = periodic_orbit(system, [0.0, 0.0], period=period)
+    with pytest.raises(
+        ValueError, match=r"where frequency = 1\.4, the drive does not repeat after that of the orbit; pass"
+    ):
+        driven.branch("frequency", 1.4)
+    with pytest.raises(
+        ValueError, match=r"where frequency = 1\.4, the drive does not repeat after this period; pass period="
+    ):
+        driven.branch("frequency", 1.4, period=lambda frequency: period + 0.0 * frequency)
 
 
 class Table(AbstractMode):
@@ -340,6 +353,8 @@ def test_an_equilibrium_is_no_orbit_and_a_small_orbit_is_found():
     system = Hybrid([Equilibrium()])
     with pytest.raises(ValueError, match="the state is an equilibrium"):
         periodic_orbit(system, [0.001, 0.0, 0.3], rises, direction="rise")
+    with pytest.raises(ValueError, match="the state is an equilibrium"):
+        periodic_orbit(system, [0.001, 0.0, 0.3], period=3.0)
     with pytest.raises(ValueError, match=r"misses it by 0\.01; the components that are not free"):
         periodic_orbit(system, [0.9, 0.01, 0.3], rises, direction="rise", free=["y0"])
     small = periodic_orbit(Hybrid([Equilibrium(1e-9)]), [0.7e-9, 0.0, 0.0], rises, direction="rise")
