@@ -233,13 +233,14 @@ def simulate_model(
     run_sampled = _sampled_alone if eventless.compiles_slowly and is_alone else _sampled
     run, extremes = run_sampled(eventless, as_number(times), as_number(t1), settings, unchecked)
     if not is_traced(extremes):
-        shortest, time, longest = np.asarray(extremes)
+        shortest, time, longest, end_time = np.asarray(extremes)
         # At a kink, only a few steps are short.
-        if shortest < SHORT * longest and float(run.end_time) < MEAN * longest * int(run.steps):
+        if shortest < SHORT * longest and end_time < MEAN * longest * int(run.steps):
             warn(
                 f"most of {int(run.steps)} steps are short; near t = {time:.6g} s, they get as short as {shortest:.1g} s, and "
                 f"elsewhere they are up to {longest:.1g} s long: are the coordinates singular there, like Euler angles at "
-                "their pole, or does a function jump? Errors may exceed the tolerance by far"
+                "their pole, or does a function jump? Errors may exceed the tolerance by far, and derivatives leave out a jump "
+                "that depends on the state: let it end a mode of a Hybrid"
             )
     return dataclasses.replace(run, model=model)
 
@@ -335,9 +336,10 @@ def problem_of_run(modules: tuple[AbstractModel, Names], cells: int | None) -> A
 
 def _run_and_extremes(
     model: AbstractModel, times: Float[Array, " times"], t1: Float[Array, ""], settings: Settings, unchecked: bool
-) -> tuple[Trajectory, Float[Array, "3"]]:
+) -> tuple[Trajectory, Float[Array, "4"]]:
     """The run, or NaN and "illegal" if a traced number is out of range; and the extremes of its steps, as in
-    `integration.Outcome`. **Arguments:** `unchecked`: whether a number is traced."""
+    `integration.Outcome`, and its end [s], which are known inside `grad`. **Arguments:** `unchecked`: whether a number is
+    traced."""
     is_legal, status, samples = sampled_if_legal(model, times, t1, settings, were_checked=not unchecked)
     outcome, names = samples.outcome, model.names
     values = model.read(names, times, nan_unless(is_legal, samples.rows), samples.mode)
@@ -357,7 +359,7 @@ def _run_and_extremes(
         settings=settings,
         names=names,
     )
-    return run, outcome.extremes[:, 0]
+    return run, jax.lax.stop_gradient(jnp.append(outcome.extremes[:, 0], outcome.end_time[0]))
 
 
 _sampled, _sampled_alone = eqx.filter_jit(_run_and_extremes), compiled_for_one(_run_and_extremes)

@@ -143,7 +143,9 @@ class AbstractSystem(eqx.Module):
     of the `force`.
 
     A system with ports, `input(self, q)`, is driven by the `input=` of a run, a function u(t, q, rate) that returns a number
-    for each port. Such a run also has these quantities, and `input_power`, which changes the energy too.
+    for each port. Such a run also has these quantities, and `input_power`, which changes the energy too. Close over a long
+    table, as in `lambda t, q, rate: jnp.interp(t, times, values)`: every number in an array of an `equinox.Module` is a
+    parameter of its own, and thousands of them take minutes to compile.
 
     **Example:** a bead on a parabolic wire z = x^2 / 2, which oscillates in about 2 pi / sqrt(g).
 

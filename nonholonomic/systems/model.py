@@ -350,9 +350,9 @@ def _(
 ) -> OwnModel:
     if input is not None and not (isinstance(system, AbstractSystem) and mechanics.is_own(system, "input")):
         raise ValueError(
-            f"input = {shown(input)} must be None for a system without ports: write input(self, q) of an AbstractSystem, whose "
-            "columns are the forces of a unit of each input; or write the input into force(t, q, rate), or into field(t, y) of "
-            "a mode"
+            f"input = {shown(input)} must be None for a Hybrid or a system without ports: write input(self, q) of an "
+            "AbstractSystem, whose columns are the forces of a unit of each input; or write the input into force(t, q, rate), "
+            "or into field(t, y) of a mode"
         )
     if jumps is not None:
         raise ValueError(

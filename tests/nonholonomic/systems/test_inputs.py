@@ -103,6 +103,24 @@ def test_a_short_pulse_is_not_missed():
     np.testing.assert_allclose(run["x_rate"], [0.0, 0.5], atol=1e-9)
 
 
+class Brake(eqx.Module):
+    """A push as far as a mark, and then back."""
+
+    mark: float
+
+    def __call__(self, t, q, rate):
+        return jnp.where(q[0] > self.mark, -1.0, 1.0)
+
+
+@pytest.mark.parametrize("transform", [lambda function: function, jax.grad], ids=["value", "derivative"])
+def test_an_input_that_jumps_with_the_state_is_warned_of(transform):
+    """Also where the run is differentiated, as the derivative lacks the effect of the jump."""
+    with pytest.warns(UserWarning, match="derivatives leave out a jump that depends on the state: let it end a mode"):
+        transform(lambda mark: simulate(Cart(0.0), REST, 3.0, times=[3.0], input=Brake(mark), tolerance=1e-11)["x"][0])(
+            1.0
+        )
+
+
 class Skate(AbstractSystem):
     """A skate of unit mass and inertia, whose blade does not slip sideways, driven along the blade and about the normal."""
 

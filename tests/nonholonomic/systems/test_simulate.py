@@ -271,7 +271,7 @@ def test_a_wrong_function_is_named(name):
 @pytest.mark.parametrize(("system", "start"), [(Hybrid([Ball()]), START), (Sleigh(), ([0.0] * 3, [0.0] * 3))])
 def test_an_input_of_a_system_without_ports_is_refused(system, start):
     message = (
-        r"input = 2\.0 must be None for a system without ports: write input\(self, q\) of an AbstractSystem, whose"
+        r"input = 2\.0 must be None for a Hybrid or a system without ports: write input\(self, q\) of an AbstractSystem"
     )
     for call in (simulate, event_time):
         with pytest.raises(ValueError, match=message):
