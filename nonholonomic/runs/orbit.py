@@ -32,7 +32,7 @@ from .branch import REASONS, Orbit
 from .continuation import FINER, NEAR, RANK, SAME_ORBIT
 from .crossings import SAME, on_margin, require_section, section_of
 from .event import Ensemble, EventTime, modes_of
-from .model import AbstractModel, check_run, model_of, settings_for_lanes
+from .model import AbstractModel, AbstractSceneModel, check_run, model_of, settings_for_lanes
 
 #: The most Newton steps; the residual at which they have converged, in units of the tolerance.
 MOST_NEWTON, CONVERGED = 30, 30.0
@@ -42,6 +42,9 @@ STENCIL, STENCIL_STEP = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0)), 1e
 
 #: Ratio of the error bound to the last Newton step.
 SAFETY = 5.0
+
+#: How much of the slope of a section may lie along shifts, as a part of it.
+UNSHIFTED = 1e-6
 
 #: The number of parts of an orbit.
 PARTS = 9
@@ -457,6 +460,32 @@ def distinct_orbits(system: object, guesses: Any, event: Any, options: dict[str,
     return orbits
 
 
+def require_unshifted(model: AbstractSceneModel) -> None:
+    """Raise `ValueError` if the event function of a section differs between starts with the same reduced state."""
+    numbers = [name for name in model.known if name.startswith("launch")]
+
+    @jax.jit
+    def slopes(*point: Array) -> tuple[Array, Array]:
+        def at_start(*point: Array) -> tuple[Array, Array]:
+            moved = model.replaced(dict(zip(numbers, point, strict=True)))
+            modes, first, states = modes_of(moved, 1, jnp.asarray(1e-9), model.comparable)
+            values = jnp.stack([jnp.asarray(mode.problem(states).event_function(states)) for mode in modes])
+            return moved.reduced(states, first)[:, 0], values[first[0], 0]
+
+        by_state, by_value = jax.jacfwd(at_start, tuple(range(len(point))))(*point)
+        return jnp.stack(by_state, axis=-1), jnp.stack(by_value)
+
+    # Aside of the start, at which the motion may be at rest or symmetric.
+    near = (jnp.asarray(model.value(name), float) + 0.02 * (1 + k) for k, name in enumerate(numbers))
+    by_state, by_value = map(np.asarray, slopes(*near))
+    left = by_value - by_state.T @ np.linalg.lstsq(by_state.T, by_value)[0]
+    if np.linalg.norm(left) > UNSHIFTED * np.linalg.norm(by_value):
+        raise ValueError(
+            "event: the section tells apart motions that the scene allows to shift, such as by their place or direction, so "
+            f"that they do not return to it; use a function of {', '.join(model.reduced_names)} and of what follows from them"
+        )
+
+
 @explaining
 @status_line("looking for a periodic orbit")
 def periodic_orbit(
@@ -485,7 +514,7 @@ def periodic_orbit(
     The orbit of a scene repeats up to the shifts that the scene allows: of place and direction on a level plane, along a
     cylinder, and around a surface of revolution. Its `state` has the other numbers of a launch: of a stroller, such as `speed`;
     of a top, such as `theta` and `angular_velocity_n`, where t1 is along the lean of the axis on a level plane, and the spin is
-    a part of the angular velocity. The section of a scene should not tell apart shifted motions, and the axis of a top must
+    a part of the angular velocity. The section of a scene must not tell apart shifted motions, and the axis of a top must
     lean there. A top that precesses steadily is at rest up to a shift, and no orbit; `tippe.steady` has these motions.
 
     If a quantity is conserved or the motion can be shifted, orbits form families, and Newton's method takes the shortest step,
@@ -551,6 +580,8 @@ def periodic_orbit(
     horizon = t1 if period is None else period
     check_run(model, horizon, tolerance)
     model = model.normalised()
+    if period is None and isinstance(model, AbstractSceneModel) and not is_traced(model):
+        require_unshifted(model)
     names = model.reduced_names
     unknown = [name for name in free or () if name not in names]
     if unknown or (free is not None and (isinstance(free, str) or not len(free))):

@@ -296,7 +296,8 @@ class TopModel(AbstractSceneModel):
         values = dict(zip(self.reduced_names, state, strict=True))
         velocity = None if isinstance(scene.friction, NoSlip) else tuple(state[-5:-3])
         numbers = (values["theta"], 0.0, values.get("eta", 0.0), values.get("azimuth", 0.0))
-        launch = Launch(*numbers, velocity=velocity, angular_velocity=tuple(state[-3:]))
+        place = (0.0, 0.0) if isinstance(scene.surface, Plane) else None
+        launch = Launch(*numbers, place=place, velocity=velocity, angular_velocity=tuple(state[-3:]))
         return dataclasses.replace(self, launch=launch, first=None if self.smooth else first[0])
 
     def reduced(self, rows: Float[Array, "rows cells"], mode: Int[Array, " cells"]) -> Float[Array, "components cells"]:

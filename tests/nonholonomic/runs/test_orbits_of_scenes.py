@@ -67,6 +67,25 @@ def test_the_nutation_of_a_top_without_friction():
     np.testing.assert_allclose(run.theta[0], theta, atol=1e-8)
 
 
+def test_a_section_that_tells_shifted_motions_apart_is_refused():
+    """Otherwise a top that has precessed by a part of a turn between two crossings seems to have returned."""
+    scene, launch = tippe.Scene(rutstam_top()), tippe.Launch(0.5, 100.0)
+    message = (
+        "event: the section tells apart motions that the scene allows to shift, .* use a function of theta, velocity_t1"
+    )
+    for section in (
+        lambda t, motion: jnp.sin(motion.azimuth - 0.3),
+        lambda t, motion: motion.position[0] - 0.001,
+        lambda t, motion: motion.velocity[0],
+    ):
+        with pytest.raises(ValueError, match=message):
+            periodic_orbit(scene, launch, section)
+    with pytest.raises(ValueError, match="use a function of speed, steering, steering_rate"):
+        periodic_orbit(
+            stroller.Scene(SPRUNG), stroller.Launch((0.0, 0.0), 0.3, 1.0), lambda t, motion: motion.heading - 1.0
+        )
+
+
 class Shaken(eqx.Module):
     """A constant drive, and a torque on the fork with a period of 2 s."""
 
