@@ -433,11 +433,13 @@ class AbstractFormulation(AbstractMode):
     **Arguments:**
 
     - `system`: the data, an `AbstractSystem`.
-    - `input`: a function u(t, q, q') -> (ports,) that acts through the ports of the system, or `None`.
+    - `input`: a function u(t, q, q') -> (ports,) that acts through the ports of the system, or `None`, the default.
     """
 
     system: eqx.AbstractVar[AbstractSystem]
-    input: eqx.AbstractVar[Input | None]
+
+    #: For formulations without an input.
+    input: ClassVar[Input | None] = None
 
     #: Whether states may have rates that violate the constraints, so that `entered` changes them.
     is_projected: ClassVar[bool] = False
@@ -497,7 +499,7 @@ class Hamel(AbstractFormulation):
     """
 
     system: AbstractSystem
-    input: Input | None = None
+    input: Input | None = eqx.field(default=None, kw_only=True)
 
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
         rate = within_constraints(self.system, q, rate)
@@ -543,7 +545,7 @@ class Lagrange(AbstractFormulation):
     """
 
     system: AbstractSystem
-    input: Input | None = None
+    input: Input | None = eqx.field(default=None, kw_only=True)
 
     @property
     def is_projected(self) -> bool:
@@ -593,7 +595,7 @@ def formulation_of(system: AbstractSystem, input: Input | None = None) -> Abstra
     """
     is_free = is_own(system, "lagrangian") and system.freedom == system.dimension
     is_hamel = (is_own(system, "frame") or is_free) and not is_driven(system)
-    return Hamel(system, input) if is_hamel else Lagrange(system, input)
+    return Hamel(system, input=input) if is_hamel else Lagrange(system, input=input)
 
 
 def energy_balance(
@@ -604,7 +606,7 @@ def energy_balance(
     The power of the supports is dE/dt - f.q': from d/dt(dL/dq') = dL/dq + f + W^T lambda and E = q'.dL/dq' - L follows
     dE/dt = q'.f + lambda.W q' - dL/dt, and the constraints are W q' = d.
     """
-    equations = Lagrange(system, input)
+    equations = Lagrange(system, input=input)
     point = (jnp.asarray(t, float), q, rate)
     direction = (np.ones(()), rate, equations.acceleration(t, q, rate))
     energy, change = jax.jvp(lambda t, q, rate: at_time(system, t).energy(q, rate), point, direction)

@@ -226,7 +226,7 @@ def test_it_is_drawn_over_time(table):
     ("change", "told"),
     [
         ({"times": []}, "times = [] must be a list of at least one number"),
-        ({"times": 1.0}, "times = 1.0 must be a list of numbers"),
+        ({"times": 1.0}, "times = 1.0 must be a list of at least one number; np.linspace makes evenly spaced ones"),
         ({"times": [0.0, 1.0, 0.5]}, "times[2] = 0.5 must be greater than times[1] = 1.0: times must increase"),
         ({"times": [-0.1, 1.0]}, "times = -0.1 must be at least 0.0"),
         ({"times": [0.0, float("nan")]}, "times = nan must be finite"),
