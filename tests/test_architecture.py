@@ -39,7 +39,7 @@ MOST_LINES = 450
 MOST_FILES_OUTSIDE = 6
 
 #: The size of the three packages: it may shrink. Imports are a share of the lines of code.
-MOST = {"files": 112, "lines": 26_055, "functions": 2615, "Any": 496, "imports": 0.0858}
+MOST = {"files": 112, "lines": 26_052, "functions": 2615, "Any": 493, "imports": 0.0858}
 
 
 class Arrow(NamedTuple):

@@ -234,7 +234,7 @@ class Branch(eqx.Module):
 
     name: str = eqx.field(static=True)
     values: Float[Array, " points"]
-    orbits: Any
+    orbits: Orbit
     kinds: tuple[str, ...] = eqx.field(static=True)
     end: str = eqx.field(static=True)
     period: Callable[[Array], Array] | None = eqx.field(static=True, default=None)
@@ -398,7 +398,7 @@ class Branch(eqx.Module):
 
 
 def continuation_of(
-    orbit: Any, name: str, until: float, period: Callable[[Array], Array] | None
+    orbit: Orbit, name: str, until: float, period: Callable[[Array], Array] | None
 ) -> tuple[Continuation, str]:
     """The continuation of an orbit, checked, and the full name of the number. **Arguments:** as for `Orbit.branch`."""
     require_outside((orbit, until), "branch", "the derivatives of periodic_orbit")
@@ -461,7 +461,7 @@ def continuation_of(
 
 @status_line("following a branch")
 def branch_of(
-    orbit: Any,
+    orbit: Orbit,
     name: str,
     until: float,
     step: float | None,

@@ -197,10 +197,8 @@ def crossings_in_cells(
             left = greatest(horizon[cell] - runs.end_time[cell], 0.0)
             transition = of_cells(modes[numbers[0]], cell).reset_map(runs.state[:, cell], left)
             new = after_reset(runs, transition, horizon)
-            is_new = (
-                jnp.isfinite(transition.crossing_time) & (runs.end_time > kept.last * (1.0 + AT_ONCE)) & ~kept.at_end
-            )
-            crosses = lost & (is_new | kept.at_end) & (new.status != FAILED)
+            jumps = jnp.isfinite(transition.crossing_time) & (runs.end_time > kept.last * (1.0 + AT_ONCE))
+            crosses = lost & (jumps | kept.at_end) & (new.status != FAILED)
             is_new = crosses & ~kept.at_end
             shown = new if after else runs
             kept = with_row(kept, is_new, crosses if after else is_new, shown.end_time, shown.state, shown.mode)

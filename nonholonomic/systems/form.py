@@ -331,7 +331,7 @@ def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
     for number, mode in mechanical.items():
         prefix = "" if mode is system else f"modes[{number}]."
         names = [name for name in mechanics.ARGUMENTS if name == "margin" or mechanics.is_own(mode, name)]
-        for name in names:
+        for name in (name for name in names if name in mechanics.TIMED):
             _check_signature(mode, name, prefix)
         if "frame" in names and mechanics.is_driven(mode):
             raise ValueError(
@@ -359,8 +359,6 @@ def _check_vector(value: Any, name: str, size: int | None) -> None:
 
 def _check_signature(system: AbstractSystem, name: str, prefix: str) -> None:
     """Raise `ValueError` unless a function that may depend on time takes its arguments, the time first."""
-    if name not in mechanics.TIMED:
-        return
     signature, has_time = inspect.signature(getattr(system, name)), mechanics.takes_time(system, name)
     arguments = mechanics.ARGUMENTS[name]
     try:

@@ -209,8 +209,8 @@ def launches(
     if stated is not None:
         require_kind(stated, "launch", Launch, several="scattered=True takes lists of their numbers, by name")
         if doubled := [name for name, value in launch_values.items() if name != "mu" and np.any(value)]:
-            given = ", ".join(f"'{name}': [...]" for name in doubled)
-            raise ValueError(f"launch must be left out where its numbers are given; or pass these by axes={{{given}}}")
+            lists = ", ".join(f"'{name}': [...]" for name in doubled)
+            raise ValueError(f"launch must be left out where its numbers are given; or pass these by axes={{{lists}}}")
         own = {name for name in launch_values if f"launch.{name}" not in axes}
         launch_values = {name: getattr(stated, name, value) for name, value in launch_values.items() if name in own}
         others = {name: value for name, value in numbers("launch", stated).items() if value is not None}
@@ -469,8 +469,9 @@ def event_table(
     table = compute_table(job, grid, request, options)
     warn_of_long_runs(table, float(t1), options.max_steps)
     # Tables whose variables stay in the file are not checked.
-    checked = model.smooth and isinstance(table.variables, dict)
-    if unresolved := np.sum(table.variables["status"] == "unresolved") if checked else 0:
+    is_checked = model.smooth and isinstance(table.variables, dict)
+    unresolved = np.sum(table.variables["status"] == "unresolved") if is_checked else 0
+    if unresolved:
         warn(f"{unresolved} of {math.prod(table.shape)} runs are unresolved: {why_unresolved(smooth=True)}")
     return table
 
