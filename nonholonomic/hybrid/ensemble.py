@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.cache import padded
-from ..compilation.xla_cpu import compiled_quickly, greatest
+from ..compilation.xla_cpu import compiled_quickly
 from ..integration import AbstractProblem, CoreProblem, Lanes, Outcome, Settings, States, follow, solve_ensemble
 from ..integration.dense import PIECE_OF_MODE
 from ..integration.problem import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
@@ -256,9 +256,9 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
 #: The `HybridOutcome` of some runs, and further data that is kept of them.
 Carry = tuple[PyTree, ...]
 
-#: (the indices of some modes, carry, a mask of cells in these modes, of which there is at least one) -> the carry after
-#: these cells have advanced.
-Advance = Callable[[Sequence[int], Carry, Bool[Numbers, " cells"]], Carry]
+#: (the indices of some modes, the indices of cells in these modes, how many of them are not padding, carry of these cells)
+#: -> the carry after these cells have advanced.
+Advance = Callable[[Sequence[int], Int[Numbers, " cells"], Int[Numbers, ""], Carry], Carry]
 
 
 def at_start(
@@ -280,11 +280,21 @@ def at_start(
     )
 
 
-def _advanced(advance: Advance, numbers: Sequence[int], carry: Carry, mask: Bool[Numbers, " cells"]) -> Carry:
-    """The carry after the masked cells have advanced, if there are any."""
-    if isinstance(mask, np.ndarray):
-        return advance(numbers, carry, mask) if mask.any() else carry
-    return jax.lax.cond(jnp.any(mask), lambda: advance(numbers, carry, mask), lambda: carry)
+def advanced(advance: Advance, numbers: Sequence[int], carry: Carry, mask: Bool[Numbers, " cells"]) -> Carry:
+    """The carry, whose arrays have the cells last, after the masked cells have advanced, if there are any."""
+    xp = mask.__array_namespace__()
+
+    def of_masked() -> Carry:
+        count, place = xp.sum(mask), xp.maximum(xp.cumsum(mask) - 1, 0)
+        # The first masked cell is the padding: in other modes, the components of the state may mean something else.
+        cell = xp.argsort(~mask, stable=True)
+        cell = xp.where(xp.arange(mask.size) < count, cell, cell[0])
+        new = advance(numbers, cell, count, of_cells(carry, cell))
+        return jax.tree.map(lambda old, new: xp.where(mask, new[..., place], old), carry, new)
+
+    if xp is np:
+        return of_masked() if mask.any() else carry
+    return jax.lax.cond(jnp.any(mask), of_masked, lambda: carry)
 
 
 def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance) -> Carry:
@@ -300,8 +310,8 @@ def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, res
     for numbers in groups:
         active = functools.reduce(operator.or_, (mode_before == number for number in numbers))
         active = active & (carry[0].status == RUNNING)
-        carry = _advanced(solve, numbers, carry, active)
-        carry = _advanced(reset, numbers, carry, active & (carry[0].status == LEFT_DOMAIN))
+        carry = advanced(solve, numbers, carry, active)
+        carry = advanced(reset, numbers, carry, active & (carry[0].status == LEFT_DOMAIN))
     return carry
 
 
@@ -328,6 +338,12 @@ def all_rounds(
         )
     runs, *records = carry
     return (runs._replace(status=xp.where(runs.status == RUNNING, UNRESOLVED, runs.status)), *records)
+
+
+def time_left(runs: HybridOutcome[Numbers], t1: Float[Numbers, " cells"]) -> Float[Numbers, " cells"]:
+    """The time [s] to the horizon."""
+    left = t1 - runs.end_time
+    return left.__array_namespace__().where(left < 0.0, 0.0, left)
 
 
 def after_solve(
@@ -385,9 +401,12 @@ def problem_of_cells(
     return of_cells(mode, cell).problem(jnp.asarray(state))
 
 
-@compiled_quickly
 def reset_of_cells(mode: AbstractBatchedMode, cell: Int[Array, " cells"], state: States, left: Lanes) -> Transition:
+    """The transition of some cells at the end of a mode."""
     return of_cells(mode, cell).reset_map(state, left)
+
+
+_reset_alone = compiled_quickly(reset_of_cells)
 
 
 def solve_hybrid(
@@ -439,98 +458,46 @@ def solve_hybrid(
     >>> print(jax.jit(solve)(5.0).crossing_time.round(6))
     [0.722438 0.812743]
     """
-    options = {"nonterminal": nonterminal, "n_blocks": n_blocks}
     xp: Any = jnp if traced else np
     horizon, groups = xp.broadcast_to(xp.asarray(t1, float), len(mode)), [(number,) for number in range(len(modes))]
     runs = at_start(xp.asarray(mode), xp.asarray(state), cells, counters)
-    if traced:
-        solve, reset = _traced_advances(modes, horizon, settings, options)
-        return all_rounds((runs,), groups, solve, reset, most_rounds)[0]
-    programs = _host_programs(modes, horizon, settings, options)
-    if cells == 0:
+    advances = _advances(modes, horizon, settings, nonterminal=nonterminal, n_blocks=n_blocks, traced=traced)
+    if not traced and cells == 0:
         # Compile the programs by running no cells: two at once, because the compiler uses little more than one core.
-        common = [number for number, of_number in enumerate(modes) if not of_number.rare]
+        common = [numbers for numbers, of_number in zip(groups, modes, strict=True) if not of_number.rare]
+        padding = np.zeros(len(mode), int)
         with ThreadPoolExecutor(2) as threads:
-            calls = itertools.product(programs, common)
-            list(threads.map(lambda call: call[0](call[1], np.arange(0), runs), calls))
-    solve, reset = _on_host(programs[0], after_solve, horizon), _on_host(programs[1], after_reset, horizon)
-    return all_rounds((runs,), groups, solve, reset, most_rounds)[0]
+            calls = itertools.product(advances, common)
+            list(threads.map(lambda call: call[0](call[1], padding, np.asarray(0), (runs,)), calls))
+    return all_rounds((runs,), groups, *advances, most_rounds)[0]
 
 
-#: (the index of a mode, the indices of some cells in this mode, the runs of all cells) -> how these cells end, in the first
-#: entries of the last axis.
-HostProgram = Callable[[int, Int[np.ndarray, " selected"], HybridOutcome[np.ndarray]], PyTree]
-
-
-def _host_programs(
-    modes: tuple[AbstractBatchedMode, ...], t1: Float[np.ndarray, " cells"], settings: Settings, options: PyTree
-) -> tuple[HostProgram, HostProgram]:
-    """The programs that solve a mode, and that reset its cells. **Arguments:** `options`: of `solve_ensemble`."""
-
-    def inputs(number: int, selected: Int[np.ndarray, " selected"], runs: HybridOutcome[np.ndarray]) -> tuple:
-        # Padded to the full number of cells.
-        padding = np.full(len(runs.status) - selected.size, selected[-1] if selected.size else 0)
-        cell = np.concatenate([selected, padding])
-        return modes[number], cell, runs.state[:, cell], np.maximum(t1[cell] - runs.end_time[cell], 0.0)
-
-    def solve(number: int, selected: Int[np.ndarray, " selected"], runs: HybridOutcome[np.ndarray]) -> Outcome:
-        *problem, left = inputs(number, selected, runs)
-        return solve_ensemble(problem_of_cells(*problem), left, np.asarray(selected.size), settings, **options)[0]
-
-    def reset(number: int, selected: Int[np.ndarray, " selected"], runs: HybridOutcome[np.ndarray]) -> Transition:
-        return reset_of_cells(*inputs(number, selected, runs))
-
-    return solve, reset
-
-
-def _on_host(program: HostProgram, update: Callable[..., HybridOutcome], t1: Float[np.ndarray, " cells"]) -> Advance:
-    """Advance cells by a program, with concrete numbers. **Arguments:** `update`: `after_solve` or `after_reset`."""
-
-    def advance(numbers: Sequence[int], carry: Carry, mask: Bool[np.ndarray, " cells"]) -> Carry:
-        (runs,), selected = carry, np.flatnonzero(mask)
-        result = program(numbers[0], selected, runs)
-        result = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], result)
-        advanced = update(HybridOutcome(*(values[..., selected] for values in runs)), result, t1[selected])
-        runs = HybridOutcome(*(values.copy() for values in runs))
-        for values, of_selected in zip(runs, advanced, strict=True):
-            values[..., selected] = of_selected
-        return (runs,)
-
-    return advance
-
-
-def _traced_advances(
-    modes: tuple[AbstractBatchedMode, ...], t1: Float[Array, " cells"], settings: Settings, options: PyTree
+def _advances(
+    modes: tuple[AbstractBatchedMode, ...],
+    t1: Float[Numbers, " cells"],
+    settings: Settings,
+    *,
+    traced: bool = False,
+    **options: Any,
 ) -> tuple[Advance, Advance]:
-    """Advance cells through a mode, and through its reset map, with traced numbers, as parts of one program."""
+    """Advance cells through a mode, and through its reset map. **Arguments:** as for `solve_hybrid`; `options`: of
+    `solve_ensemble`."""
+    xp = t1.__array_namespace__()
+    reset_map: Callable[..., Transition] = reset_of_cells if traced else _reset_alone
 
-    def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
-        (runs,), cell = carry, selected_cells(active)
-        left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
-        problem = of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
-        outcome, _ = solve_ensemble(problem, left, jnp.asarray(len(active)), settings, traced=True, **options)
-        return (chosen(active, after_solve(runs, outcome, t1), runs),)
+    def solve(numbers: Sequence[int], cell: Int[Numbers, " cells"], count: Int[Numbers, ""], carry: Carry) -> Carry:
+        (runs,), horizon = carry, t1[cell]
+        problem = problem_of_cells(modes[numbers[0]], cell, runs.state)
+        left = time_left(runs, horizon)
+        outcome, _ = solve_ensemble(problem, left, count, settings, traced=traced, **options)
+        return (after_solve(runs, jax.tree.map(xp.asarray, outcome), horizon),)
 
-    def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
-        (runs,), cell = carry, selected_cells(lost)
-        left = greatest(t1[cell] - runs.end_time[cell], 0.0)
-        transition = of_cells(modes[numbers[0]], cell).reset_map(runs.state[:, cell], left)
-        return (chosen(lost, after_reset(runs, transition, t1), runs),)
+    def reset(numbers: Sequence[int], cell: Int[Numbers, " cells"], _: Int[Numbers, ""], carry: Carry) -> Carry:
+        (runs,), horizon = carry, t1[cell]
+        transition = reset_map(modes[numbers[0]], cell, runs.state, time_left(runs, horizon))
+        return (after_reset(runs, jax.tree.map(xp.asarray, transition), horizon),)
 
     return solve, reset
-
-
-def selected_cells(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
-    """The indices of the selected cells. The first selected cell replaces all others: in other modes, the components of the
-    state may mean something else."""
-    return jnp.where(selected, jnp.arange(selected.size), jnp.argmax(selected))
-
-
-def chosen(
-    selected: Bool[Array, " cells"], new: HybridOutcome[Array], old: HybridOutcome[Array]
-) -> HybridOutcome[Array]:
-    """The new outcome for the selected cells, and the old outcome for the others."""
-    return jax.tree.map(lambda a, b: jnp.where(selected, a, b), new, old)
 
 
 def hybrid_resets(
@@ -558,11 +525,10 @@ def hybrid_resets(
     [0.451524] [-4.429447] [2.657668]
     """
     horizon, resets = np.full(1, float(t1)), []
-    programs = _host_programs(modes, horizon, settings, {})
-    solve, leave = _on_host(programs[0], after_solve, horizon), _on_host(programs[1], after_reset, horizon)
+    solve, leave = _advances(modes, horizon, settings)
 
-    def reset(numbers: Sequence[int], carry: Carry, lost: Bool[np.ndarray, "1"]) -> Carry:
-        after = leave(numbers, carry, lost)
+    def reset(numbers: Sequence[int], cell: Int[np.ndarray, "1"], count: np.ndarray, carry: Carry) -> Carry:
+        after = leave(numbers, cell, count, carry)
         resets.append((*carry, *after))
         return after
 
@@ -723,9 +689,9 @@ def solve_hybrid_dense(
     """
 
     horizon, segments = np.full(1, float(t1)), []
-    _, leave = _host_programs(modes, horizon, settings, {})
 
-    def solve(number: int, _: Int[np.ndarray, "1"], runs: HybridOutcome[np.ndarray]) -> Outcome[np.ndarray]:
+    def solve(numbers: Sequence[int], cell: Int[np.ndarray, "1"], _: np.ndarray, carry: Carry) -> Carry:
+        (runs,), number = carry, numbers[0]
         begin, steps = runs.end_time[0].item(), runs.steps[0].item()
         problem = problem_of_cells(modes[number], 0, runs.state[:, 0])
         rest = dataclasses.replace(settings, max_steps=settings.max_steps - steps)
@@ -736,25 +702,25 @@ def solve_hybrid_dense(
         status = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
         none, ending = np.full(1, np.inf), (np.asarray(path.times[-1:]), np.asarray(path.states[:, -1:]))
         counts = (np.full(1, path.accepted + path.rejected), np.full(1, path.rejected), np.array([NO_EXTREMES]).T)
-        return Outcome(np.full(1, status), none, none, *ending, *counts)
+        return (after_solve(runs, Outcome(np.full(1, status), none, none, *ending, *counts), horizon),)
 
-    def reset(number: int, selected: Int[np.ndarray, "1"], runs: HybridOutcome[np.ndarray]) -> Transition:
-        transition = leave(number, selected, runs)
+    def reset(numbers: Sequence[int], cell: Int[np.ndarray, "1"], _: np.ndarray, carry: Carry) -> Carry:
+        (runs,), mode = carry, modes[numbers[0]]
+        transition = jax.tree.map(np.asarray, _reset_alone(mode, cell, runs.state, time_left(runs, horizon)))
         if transition.record is not None:
             # NumPy slices these arrays, because JAX would compile every slice.
-            ends, motions, parts = jax.tree.map(np.asarray, transition.record)
+            ends, motions, parts = transition.record
             begin = runs.end_time[0].item()
             ends = begin + ends[np.isfinite(ends[:, 0]), 0]
             for index, (end, count) in enumerate(zip(ends.tolist(), parts[:, 0].tolist(), strict=False)):
                 motion = jax.tree.map(lambda leaf, index=index: leaf[index].copy(), motions)
                 times = begin + (end - begin) * np.linspace(0.0, 1.0, count + 1)[1:]
-                segments.append(Segment(begin, end, BETWEEN, modes[number], motion, times))
+                segments.append(Segment(begin, end, BETWEEN, mode, motion, times))
                 begin = end
-        return transition._replace(record=None)
+        return (after_reset(runs, transition, horizon),)
 
     start = at_start(np.full(1, number), np.asarray(state)[:, None], 1, counters)
-    advances = (_on_host(solve, after_solve, horizon), _on_host(reset, after_reset, horizon))
-    (runs,) = all_rounds((start,), [(mode,) for mode in range(len(modes))], *advances)
+    (runs,) = all_rounds((start,), [(mode,) for mode in range(len(modes))], solve, reset)
     end_time, status, steps, rejected = (
         values[0].item() for values in (runs.end_time, runs.status, runs.steps, runs.rejected)
     )

@@ -8,10 +8,9 @@ map has a transpose; other reset maps are differentiated along every number of t
 samples, of the checkpoints, and of the adjoint of one mode.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,7 +19,6 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..compilation.xla_cpu import greatest
 from ..derivatives import SampledRun, tangents_of
 from ..derivatives.adjoint import SampledCotangents, mixture, samples_pulled_back, there_and_back
 from ..derivatives.sampled_runs import AbstractSampling, Options, solve_for_samples
@@ -34,13 +32,13 @@ from .ensemble import (
     AbstractBatchedMode,
     Carry,
     HybridOutcome,
+    advanced,
     at_start,
-    chosen,
     mode_numbered,
     one_round,
     over_cells,
     program_groups,
-    selected_cells,
+    time_left,
 )
 from .saltation import VariationalMode, along, delay, variational_modes, variational_start
 from .samples import Built, Recorded, output_rows, reset_with_rows, sampled_rounds, sampled_with_tangents, weighted
@@ -278,12 +276,12 @@ def hybrid_samples_pulled_back(
     _, (rate,) = output_rows(variational, initial)
     shown = jnp.where((times <= 0.0) & (rate == 0.0), 0.0, shown)
 
-    def solved(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
-        runs, output = solve(numbers, carry[:2], active)
-        return runs, output, chosen(active, runs, carry[2])
+    def solved(numbers: Sequence[int], cell: Int[Array, " cells"], count: Int[Array, ""], carry: Carry) -> Carry:
+        runs, output = solve(numbers, cell, count, carry[:2])
+        return runs, output, runs
 
-    def left(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
-        return (*reset(numbers, carry[:2], lost), carry[2])
+    def left(numbers: Sequence[int], cell: Int[Array, " cells"], count: Int[Array, ""], carry: Carry) -> Carry:
+        return (*reset(numbers, cell, count, carry[:2]), carry[2])
 
     # The samples so far, and the rounds that they belong to.
     def forward(number: Int[Array, ""], before: HybridOutcome[Array], recorded: Carry) -> tuple[PyTree, Kept, Carry]:
@@ -299,12 +297,12 @@ def hybrid_samples_pulled_back(
         ends = running & ((kept.status != RUNNING) | (number == MOST_ROUNDS - 1))
         by_end = jnp.where(kept.status == REACHED_END, 0.0, end_time)
         costate = costate._replace(start_time=jnp.where(ends, by_end, costate.start_time))
+        stage = Round(variational, kept, output, owner == number, times, t1, shown)
         for group in groups:
             active = running & functools.reduce(jnp.logical_or, (kept.before.mode == mode for mode in group))
-            stage = _Stage(variational, group, kept, output, active & (owner == number), (times, t1), settings, shown)
             lost = active & (kept.ended.status == LEFT_DOMAIN)
-            for mask, step in ((lost, stage.through_reset), (active, stage.through_motion)):
-                costate = jax.lax.cond(jnp.any(mask), step, lambda _, costate: costate, mask, costate)
+            (costate,) = advanced(stage.through_reset, group, (costate,), lost)
+            (costate,) = advanced(functools.partial(stage.through_motion, settings), group, (costate,), active)
         return costate
 
     no_cells = jnp.zeros(cells, bool)
@@ -329,31 +327,30 @@ def hybrid_samples_pulled_back(
     return [jnp.where(costate.invalid, jnp.nan, part) for part in by_point]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Stage:
-    """The backward pass through one round of the modes of a group.
+class Round(NamedTuple):
+    """A round of some runs, for the backward pass. The arrays have the cells last.
 
-    - `modes`: with a tangent that moves all numbers; `owned`: the samples of the round.
-    - `horizon`: times of the samples and ends of the runs [s]; `shown`: the cotangents of the samples.
+    - `modes`: with a tangent that moves all numbers; `output`, `owned`: the samples, and those of the part.
+    - `times`, `t1`: times of the samples and ends of the runs [s]; `shown`: the cotangents of the samples.
     """
 
     modes: tuple[VariationalMode, ...]
-    group: Sequence[int]
     kept: Kept
     output: Recorded
     owned: Bool[Array, "times cells"]
-    horizon: tuple[Float[Array, "times cells"], Lanes]
-    settings: Settings
+    times: Float[Array, "times cells"]
+    t1: Lanes
     shown: Float[Array, "shown times cells"]
 
-    def through_reset(self, lost: Bool[Array, " cells"], costate: Costate) -> Costate:
-        """Carry the derivatives from the start of the next mode to the end of the mode."""
-        (times, t1), cell = self.horizon, selected_cells(lost)
-        numbers, _, build = self._mode(cell)
-        primal, duration = self._primal(self.kept.ended, cell)
-        left = greatest(t1[cell] - self.kept.ended.end_time[cell], 0.0)
-        by_state, by_time = jnp.where(lost, costate.state, 0.0), jnp.where(lost, costate.start_time, 0.0)
-        weights = jnp.where(self.owned & (self.output.number == BETWEEN), self.shown, 0.0)
+    def through_reset(
+        self, group: Sequence[int], cell: Int[Array, " cells"], count: Int[Array, ""], carry: tuple[Costate]
+    ) -> tuple[Costate]:
+        """Carry the derivatives of some cells from the start of the next mode to the end of the mode."""
+        (costate,), part = carry, of_cells(self, cell)
+        numbers, _, build = part.mode(group)
+        primal, duration = part.primal(part.kept.ended)
+        left, by_time = time_left(part.kept.ended, part.t1), costate.start_time
+        weights = jnp.where(part.owned & (part.output.number == BETWEEN), part.shown, 0.0)
 
         def share(primal: States, start_time: Lanes, *numbers: Array) -> Array:
             """The share of the later run in the sum; the reset moves with the event (`saltation.py`)."""
@@ -364,32 +361,35 @@ class _Stage:
             later = jnp.where(duration > 0.0, later, 0.0)
             state, left_then = primal + rates * later, left - start_time - later
             transition, rows = reset_with_rows(
-                mode, state, left_then, times[:, cell] - t1[cell] + left_then, t1[cell], weights
+                mode, state, left_then, part.times - part.t1 + left_then, part.t1, weights
             )
             by_end = weighted(by_time, start_time + later + transition.elapsed)
-            total = by_end + jnp.sum(weighted(by_state, transition.state), axis=0)
+            total = by_end + jnp.sum(weighted(costate.state, transition.state), axis=0)
             return total if rows is None else total + rows
 
-        matters = jnp.any(by_state != 0.0, axis=0) | (by_time != 0.0) | jnp.any(weights != 0.0, axis=(0, 1))
+        matters = jnp.any(costate.state != 0.0, axis=0) | (by_time != 0.0) | jnp.any(weights != 0.0, axis=(0, 1))
         gradients = _gradients(share, (primal, jnp.zeros_like(duration), *numbers))
         by_primal, by_start_time, *by_numbers = (jnp.where(matters, gradient, 0.0) for gradient in gradients)
-        return Costate(
-            jnp.where(lost, by_primal, costate.state),
-            jnp.where(lost, by_start_time, costate.start_time),
-            self._added(costate.numbers, lost, by_numbers),
-            costate.invalid | (lost & matters & self.kept.grazes),
-        )
+        invalid = costate.invalid | (matters & part.kept.grazes)
+        return (Costate(by_primal, by_start_time, part.added(group, costate.numbers, by_numbers), invalid),)
 
-    def through_motion(self, active: Bool[Array, " cells"], costate: Costate) -> Costate:
-        """Carry the derivatives from the end of the mode to its start."""
-        (times, t1), cell, (before, ended, *_) = self.horizon, selected_cells(active), self.kept
-        numbers, rates, build = self._mode(cell)
-        start, variation = (part[:-1, cell] for part in self.modes[0].parts(before.state))
-        left = greatest(t1 - before.end_time, 0.0)
-        duration = jnp.where(ended.status == REACHED_END, left, self._primal(ended)[1])
-        duration = jnp.where(active, duration, 0.0)
-        owned = self.owned & (self.output.number != BETWEEN)
-        samples = jnp.where(owned, self.output.state[: len(start)], start[:, None])
+    def through_motion(
+        self,
+        settings: Settings,
+        group: Sequence[int],
+        cell: Int[Array, " cells"],
+        count: Int[Array, ""],
+        carry: tuple[Costate],
+    ) -> tuple[Costate]:
+        """Carry the derivatives of some cells from the end of the mode to its start."""
+        (costate,), part = carry, of_cells(self, cell)
+        before, ended, *_ = part.kept
+        numbers, rates, build = part.mode(group)
+        start, variation = (rows[:-1] for rows in part.modes[0].parts(before.state))
+        duration = jnp.where(ended.status == REACHED_END, time_left(before, part.t1), part.primal(ended)[1])
+        duration = jnp.where(jnp.arange(len(cell)) < count, duration, 0.0)
+        owned = part.owned & (part.output.number != BETWEEN)
+        samples = jnp.where(owned, part.output.state[: len(start)], start[:, None])
 
         def rows(
             samples: Float[Array, "components times cells"], start_time: Float[Array, "times cells"], *numbers: Array
@@ -402,57 +402,49 @@ class _Stage:
             elapsed = jnp.broadcast_to(duration, start_time.shape)
             return over_cells(of_cell, build(*numbers))(samples, start_time, elapsed)
 
-        pull = jax.vjp(rows, samples, jnp.zeros_like(times), *numbers)[1]
-        by_samples, by_start_time, *by_numbers = pull(jnp.where(owned, self.shown, 0.0))
-        by_samples, by_start_time = (jnp.where(owned, part, 0.0) for part in (by_samples, by_start_time))
+        pull = jax.vjp(rows, samples, jnp.zeros_like(part.times), *numbers)[1]
+        by_samples, by_start_time, *by_numbers = pull(jnp.where(owned, part.shown, 0.0))
+        by_samples, by_start_time = (jnp.where(owned, by, 0.0) for by in (by_samples, by_start_time))
         # Rounding may put a sample after the end of the mode.
-        times_in_mode = times - before.end_time
+        times_in_mode = part.times - before.end_time
         times_in_mode = jnp.where(owned, jnp.minimum(times_in_mode, duration), times_in_mode)
-        at_end = jnp.where(active & (ended.status == LEFT_DOMAIN), costate.state, 0.0)
+        at_end = jnp.where(ended.status == LEFT_DOMAIN, costate.state, 0.0)
         by_start, *by_problem = samples_pulled_back(
             lambda state, *numbers: EndlessProblem(build(*numbers).problem(state)),
             (start, *numbers),
             SampledCotangents(jnp.transpose(by_samples, (2, 1, 0)), jnp.zeros_like(duration), at_end),
             times_in_mode,
             duration,
-            self.settings,
+            settings,
             [variation, *rates],
         )
         by_numbers = [one + other for one, other in zip(by_numbers, by_problem, strict=True)]
-        return costate._replace(
-            state=jnp.where(active, by_start, costate.state),
-            start_time=costate.start_time + jnp.sum(by_start_time, axis=0),
-            numbers=self._added(costate.numbers, active, by_numbers),
-        )
+        start_time = costate.start_time + jnp.sum(by_start_time, axis=0)
+        added = part.added(group, costate.numbers, by_numbers)
+        return (costate._replace(state=by_start, start_time=start_time, numbers=added),)
 
-    def _primal(self, runs: HybridOutcome[Array], cell: Any = ...) -> tuple[States, Lanes]:
-        """The states of some cells, and the time since their modes began."""
+    def primal(self, runs: HybridOutcome[Array]) -> tuple[States, Lanes]:
+        """The states of the runs, and the time since their modes began."""
         state = self.modes[0].parts(runs.state)[0]
-        return state[:-1, cell], state[-1, cell]
+        return state[:-1], state[-1]
 
-    def _mode(
-        self, cell: Int[Array, " cells"]
+    def mode(
+        self, group: Sequence[int]
     ) -> tuple[list[Float[Array, "... cells"]], list[Array], Callable[..., AbstractBatchedMode]]:
-        """The moving numbers of the mode of some cells, their rates, and the mode as a function of the numbers."""
-        mode = of_cells(mode_numbered(self.modes, self.group, self.kept.before.mode), cell)
-        numbers, build = mode.active_numbers()
-        numbers, rates = (
-            [with_cells(leaf, len(cell)) for leaf in leaves] for leaves in (numbers, mode.directions()[0])
-        )
-        return numbers, rates, build
+        """The moving numbers of the modes, their rates, and the modes as a function of the numbers."""
+        mode = mode_numbered(self.modes, group, self.kept.before.mode)
+        (numbers, build), (rates,) = mode.active_numbers(), mode.directions()
+        sizes = len(self.t1)
+        return [with_cells(leaf, sizes) for leaf in numbers], [with_cells(leaf, sizes) for leaf in rates], build
 
-    def _added(
-        self, numbers: list[list[Array]], cells: Bool[Array, " cells"], shares: list[Array]
-    ) -> list[list[Array]]:
-        """The derivatives with respect to the numbers of all modes, with the shares of some cells in this group."""
+    def added(self, group: Sequence[int], numbers: list[list[Array]], shares: list[Array]) -> list[list[Array]]:
+        """The derivatives with respect to the numbers of all modes, with the shares of this group."""
 
         def of_mode(number: int, sums: list[Array]) -> list[Array]:
-            if number not in self.group:
-                return sums
-            is_here = cells & (self.kept.before.mode == number)
+            is_here = self.kept.before.mode == number
             return [total + jnp.where(is_here, share, 0.0) for total, share in zip(sums, shares, strict=True)]
 
-        return [of_mode(number, sums) for number, sums in enumerate(numbers)]
+        return [of_mode(number, sums) if number in group else sums for number, sums in enumerate(numbers)]
 
 
 def _gradients(

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..compilation.xla_cpu import compiled_alone, greatest
+from ..compilation.xla_cpu import compiled_alone
 from ..derivatives import SampledRun, in_groups
 from ..integration import Lanes, Settings, States, solve_with_samples
 from ..integration.problem import LEFT_DOMAIN, REACHED_END
@@ -26,12 +26,11 @@ from .ensemble import (
     after_solve,
     all_rounds,
     at_start,
-    chosen,
     mode_numbered,
     over_cells,
     program_groups,
     resolution,
-    selected_cells,
+    time_left,
 )
 from .saltation import Tangents, VariationalMode, variational_modes, variational_start
 
@@ -174,34 +173,31 @@ def sampled_rounds(
 
     **Returns:** the arguments of `all_rounds`; the carry is a `HybridOutcome` and the `Recorded` samples.
     """
-    size = times.shape[1]
 
-    def solve(numbers: Sequence[int], carry: Carry, active: Bool[Array, " cells"]) -> Carry:
-        (runs, output), cell = carry, selected_cells(active)
-        mode = of_cells(mode_numbered(modes, numbers, runs.mode), cell)
-        # Runs in another mode spend no time in this one.
-        left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
-        times_in_mode = times - runs.end_time
-        problem, count = mode.problem(runs.state[:, cell]), jnp.asarray(size)
+    def solve(numbers: Sequence[int], cell: Int[Array, " cells"], count: Int[Array, ""], carry: Carry) -> Carry:
+        (runs, output), times_here, horizon = carry, times[:, cell], t1[cell]
+        mode = mode_numbered(of_cells(modes, cell), numbers, runs.mode)
+        times_in_mode = times_here - runs.end_time
+        problem, left = mode.problem(runs.state), time_left(runs, horizon)
         options = {"n_blocks": n_blocks, "one_kernel": True}
         outcome, samples = solve_with_samples(problem, times_in_mode, left, count, settings, **options)
-        after = chosen(active, after_solve(runs, outcome, t1), runs)
+        after = after_solve(runs, outcome, horizon)
         # A sample at the time of a reset is the state before it.
-        is_last = abs(times - after.end_time) <= resolution(runs.end_time, after.end_time)
+        is_last = abs(times_here - after.end_time) <= resolution(runs.end_time, after.end_time)
         is_last &= outcome.status == LEFT_DOMAIN
         samples = jnp.moveaxis(samples, -1, 0).swapaxes(1, 2)
         samples = jnp.where(is_last, outcome.state[:, None], samples)
-        is_within = (times_in_mode >= 0.0) & (times <= after.end_time)
-        is_new = active & (is_within | is_last) & jnp.isnan(output.number)
+        is_within = (times_in_mode >= 0.0) & (times_here <= after.end_time)
+        is_new = (is_within | is_last) & jnp.isnan(output.number)
         state = jnp.where(is_new, samples, output.state)
         return after, output._replace(state=state, number=jnp.where(is_new, runs.mode, output.number))
 
-    def reset(numbers: Sequence[int], carry: Carry, lost: Bool[Array, " cells"]) -> Carry:
-        runs, output = carry
-        transition, rows = _reset(numbers, runs, selected_cells(lost))
-        after = chosen(lost, after_reset(runs, transition, t1), runs)
+    def reset(numbers: Sequence[int], cell: Int[Array, " cells"], _: Int[Array, ""], carry: Carry) -> Carry:
+        (runs, output), times_here = carry, times[:, cell]
+        transition, rows = _reset(numbers, cell, runs)
+        after = after_reset(runs, transition, t1[cell])
         if rows is not None:
-            is_new = lost & (times > runs.end_time) & (times <= after.end_time) & jnp.isnan(output.number)
+            is_new = (times_here > runs.end_time) & (times_here <= after.end_time) & jnp.isnan(output.number)
             between, number = jnp.where(is_new, rows, output.between), jnp.where(is_new, BETWEEN, output.number)
             output = output._replace(between=between, number=number)
         grazes = after.counts[-1] > runs.counts[-1]
@@ -209,21 +205,21 @@ def sampled_rounds(
         return after, output._replace(grazing_time=grazing_time)
 
     def _reset(
-        numbers: Sequence[int], runs: HybridOutcome[Array], cell: Int[Array, " cells"]
+        numbers: Sequence[int], cell: Int[Array, " cells"], runs: HybridOutcome[Array]
     ) -> tuple[Transition, Array | None]:
         """The transition of some cells, and its output rows with their variations."""
+        horizon = t1[cell]
 
         def with_rows(mode: AbstractBatchedMode, state: States, left: Lanes) -> tuple[Transition, Array | None]:
             # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
-            return reset_with_rows(mode, state, left, times[:, cell] - t1[cell] + left, t1[cell])
+            return reset_with_rows(mode, state, left, times[:, cell] - horizon + left, horizon)
 
-        mode = of_cells(mode_numbered(modes, numbers, runs.mode), cell)
-        left = greatest(t1[cell] - runs.end_time[cell], 0.0)
-        transition, rows, variations = mode.reset_with_path(runs.state[:, cell], left, with_rows)
+        mode = mode_numbered(of_cells(modes, cell), numbers, runs.mode)
+        transition, rows, variations = mode.reset_with_path(runs.state, time_left(runs, horizon), with_rows)
         return transition, None if rows is None else jnp.concatenate([rows[None], variations])
 
-    groups = program_groups(modes)
-    rows = [jax.eval_shape(functools.partial(_reset, group), start, jnp.arange(size))[1] for group in groups]
+    groups, size = program_groups(modes), times.shape[1]
+    rows = [jax.eval_shape(functools.partial(_reset, group), jnp.arange(size), start)[1] for group in groups]
     between = next((jnp.zeros(shape.shape) for shape in rows if shape is not None), None)
     missing = jnp.full((len(start.state), *times.shape), jnp.nan)
     empty = Recorded(missing, missing[0], between, jnp.full(size, jnp.inf))

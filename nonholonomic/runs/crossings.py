@@ -4,7 +4,6 @@ A run continues through its crossings and through its resets; nothing starts aga
 lanes, and the resets that cross in the rounds of the modes.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -19,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, greatest, written_in_place
 from ..hybrid import MOST_ROUNDS
-from ..hybrid.ensemble import after_reset, after_solve, all_rounds, at_start, chosen, over_cells, selected_cells
+from ..hybrid.ensemble import after_reset, after_solve, all_rounds, at_start, over_cells, time_left
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ..integration.scheduler import InLanes, LaneScheduler, Recorder, of_cells
@@ -166,17 +165,17 @@ def crossings_in_cells(
         rows, ended, counted = kept.state, outcome, ()
     else:
         modes, first, states = modes_of(model, size, settings.tolerance, names, True)
-        horizon = jnp.broadcast_to(t1, (size,))
+        horizons = jnp.broadcast_to(t1, (size,))
 
-        def solve(numbers: Sequence[int], carry: PyTree, active: Bool[Array, " cells"]) -> PyTree:
-            (runs, kept), cell = carry, selected_cells(active)
-            left = jnp.where(active, greatest(horizon - runs.end_time, 0.0), 0.0)
-            problem = of_cells(modes[numbers[0]], cell).problem(runs.state[:, cell])
+        def solve(numbers: Sequence[int], cell: Array, running: Array, carry: PyTree) -> PyTree:
+            (runs, kept), horizon = carry, horizons[cell]
+            problem = of_cells(modes[numbers[0]], cell).problem(runs.state)
             value, slope, error = near_zero(problem, jnp.zeros(size), problem.start()[0])
             is_on = kept.beyond & (jnp.abs(value) <= error) & (slope < 0.0)
             leaves = jnp.where(is_on, -2.0 * error / jnp.where(is_on, slope, 1.0), -jnp.inf)
             leaves = greatest(leaves, kept.last + AT_ONCE * runs.end_time - runs.end_time)
-            scheduler = LaneScheduler.of(problem, left, jnp.asarray(size), settings, nonterminal=True, one_kernel=True)
+            options = {"nonterminal": True, "one_kernel": True}
+            scheduler = LaneScheduler.of(problem, time_left(runs, horizon), running, settings, **options)
             outcome, _, new = scheduler.solve(CrossingRecorder(skip, count, runs.end_time, leaves, numbers[0]), kept)
             if after:
                 is_reset = (outcome.status == CROSSED) & on_margin(problem, outcome.end_time, outcome.state)
@@ -189,25 +188,22 @@ def crossings_in_cells(
             crosses, time = new.counted > kept.counted, runs.end_time + outcome.crossing_time
             resets, last = jnp.where(crosses, 0, kept.resets), jnp.where(crosses, time, kept.last)
             new = new._replace(at_end=at_end, beyond=value <= error, resets=resets, last=last)
-            advanced = (after_solve(runs, outcome, horizon), new)
-            return jax.tree.map(functools.partial(jnp.where, active), advanced, carry)
+            return after_solve(runs, outcome, horizon), new
 
-        def reset(numbers: Sequence[int], carry: PyTree, lost: Bool[Array, " cells"]) -> PyTree:
-            (runs, kept), cell = carry, selected_cells(lost)
-            left = greatest(horizon[cell] - runs.end_time[cell], 0.0)
-            transition = of_cells(modes[numbers[0]], cell).reset_map(runs.state[:, cell], left)
+        def reset(numbers: Sequence[int], cell: Array, _: Array, carry: PyTree) -> PyTree:
+            (runs, kept), horizon = carry, horizons[cell]
+            transition = of_cells(modes[numbers[0]], cell).reset_map(runs.state, time_left(runs, horizon))
             new = after_reset(runs, transition, horizon)
             jumps = jnp.isfinite(transition.crossing_time) & (runs.end_time > kept.last * (1.0 + AT_ONCE))
-            crosses = lost & (jumps | kept.at_end) & (new.status != FAILED)
+            crosses = (jumps | kept.at_end) & (new.status != FAILED)
             is_new = crosses & ~kept.at_end
             shown = new if after else runs
             kept = with_row(kept, is_new, crosses if after else is_new, shown.end_time, shown.state, shown.mode)
-            resets, last = jnp.where(is_new, 0, kept.resets + lost), jnp.where(is_new, runs.end_time, kept.last)
-            kept = kept._replace(at_end=kept.at_end & ~lost, resets=resets, last=last)
+            resets, last = jnp.where(is_new, 0, kept.resets + 1), jnp.where(is_new, runs.end_time, kept.last)
+            kept = kept._replace(at_end=jnp.zeros(size, bool), resets=resets, last=last)
             is_last = kept.counted >= skip + count
             status = jnp.where(is_last, CROSSED, jnp.where(kept.resets >= MOST_ROUNDS, UNRESOLVED, new.status))
-            new = new._replace(status=jnp.where(new.status == RUNNING, status, new.status))
-            return chosen(lost, new, runs), kept
+            return new._replace(status=jnp.where(new.status == RUNNING, status, new.status)), kept
 
         groups, runs = [(number,) for number in range(len(modes))], at_start(first, states, cells, len(model.counters))
         # As many resets between two crossings as in a run.
