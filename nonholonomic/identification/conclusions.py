@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ..text import counted
 from .exploration import FARTHEST, ROWS, Explorer, Pool, fitted, squared_distances, weighted_covariance
-from .posterior import Coordinates, Matrix, Measurements, PerPoint, Points, Problem, deviances, predictions
+from .posterior import Coordinates, Matrix, Measurements, PerPoint, Points, Problem, predictions, weighed
 from .search import Minima, minimise
 
 # Only for type checkers: results stand above conclusions.
@@ -264,7 +264,7 @@ def profiled(fit: "Identification", k: int, values: Float[np.ndarray, " points"]
         trial[..., others] += NARROWER**batch * random.normal(size=(points, each, size - 1)) @ root.T
         trial[:, 0] = best
         rows = trial.reshape(-1, size)
-        deviance = deviances(fit.density, rows, predictions(problem, rows))
+        deviance = weighed(fit.density, rows, predictions(problem, rows)).deviance
         deviance = np.where(np.isfinite(deviance), deviance, np.inf).reshape(points, each)
         place = np.argmin(deviance, axis=1)
         improved = deviance[np.arange(points), place]
@@ -273,10 +273,10 @@ def profiled(fit: "Identification", k: int, values: Float[np.ndarray, " points"]
     converged = np.isfinite(least)
     if size > 1:
         ends = minimise(fit.density, best, fixed=k)
-        at_ends, converged = ends.linearised.deviance, ends.converged
-        improves = np.isfinite(at_ends) & (at_ends <= least)
-        best = np.where(improves[:, None], ends.coordinates, best)
-        least = np.where(improves, at_ends, least)
+        at_ends, converged = ends.linearised, ends.converged
+        improves = np.isfinite(at_ends.deviance) & (at_ends.deviance <= least)
+        best = np.where(improves[:, None], at_ends.coordinates, best)
+        least = np.where(improves, at_ends.deviance, least)
     optima = problem.unknowns.values(best)
     estimates = {other: optima[:, i] for i, other in enumerate(problem.names) if i != k}
     return Profile(values, least - fit.deviance, estimates, converged)

@@ -420,13 +420,12 @@ class Explorer(NamedTuple):
         weights, k = smoothed_weights(np.where(np.isfinite(logs), logs, -np.inf))
         return pool._replace(weights=weights, k=k, effective=independent_number(pool.points, weights))
 
-    def explore(self, pool: Pool, minima: Mixture | None, progress: bool) -> Pool:
+    def explore(self, pool: Pool, minima: Mixture | None) -> Pool:
         """Adapt proposals to the posterior, round by round.
 
-        **Arguments:** `pool`: from `begin`; `minima`: a component around each minimum that is known, or `None`;
-        `progress`: whether to show progress.
+        **Arguments:** `pool`: from `begin`; `minima`: a component around each minimum that is known, or `None`.
         """
-        with Progress(ROUNDS, "round", shown=progress) as display:
+        with Progress(ROUNDS, "round") as display:
             display.begin()
             for _ in range(ROUNDS):
                 mixture = self.proposal(pool, minima, 0.6 if len(pool.proposals) == 1 else KEPT)
@@ -471,7 +470,7 @@ class Explorer(NamedTuple):
         likelihood = np.sum(each[:, ~estimated], axis=1)
         for scales, logs in _by_error(measurements, predictions, residual):
             likelihood = likelihood + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])
-        prior = np.asarray(self.density.log_priors(batch))
+        prior = np.asarray(self.density.problem.unknowns.log_priors(batch))
         prior = np.where(inside, prior[: len(points)], -np.inf)
         groups = np.stack([np.sum(each[:, self.group == k], axis=1) for k in np.unique(self.group)], axis=1)
         # 0 in the region; outside, less with the square of the distance.

@@ -173,10 +173,6 @@ class Measurements(eqx.Module):
         measured = jnp.where(self.censored, 0.0, jnp.log(self.error))
         return -jnp.sum(0.5 * self.residuals(prediction) ** 2 + measured, axis=-1)
 
-    def with_errors(self, error: Float[Array | np.ndarray, "... n"]) -> "Measurements":
-        """The same measurements with other errors."""
-        return eqx.tree_at(lambda measurements: measurements.error, self, jnp.broadcast_to(error, self.error.shape))
-
 
 def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
     """The residual -sqrt(-2 log Phi(z)) of a lower limit; 0 if its magnitude is less than 1e-9."""
@@ -473,12 +469,13 @@ class Problem(eqx.Module):
 class Linearised(NamedTuple):
     """A model and its likelihood at a point of every row.
 
-    - `prediction`: (rows, n); `slopes`: (rows, n, unknowns), with respect to the coordinates.
+    - `coordinates`: (rows, unknowns); `prediction`: (rows, n); `slopes`: (rows, n, unknowns), with respect to the coordinates.
     - `residual`: (rows, residuals), of the n data, then of the priors; `jacobian`: (rows, residuals, unknowns), its slopes.
     - `information`: the same with the expected curvature of the likelihood (`Measurements.roots_of_information`), for
       errors.
     """
 
+    coordinates: Rows
     prediction: Float[np.ndarray, "rows n"]
     slopes: Float[np.ndarray, "rows n unknowns"]
     residual: Float[np.ndarray, "rows residuals"]
@@ -566,20 +563,14 @@ def weighed(
     density: "LogDensity",
     coordinates: Rows,
     prediction: Float[np.ndarray, "rows n"],
-    slopes: Float[np.ndarray, "rows n unknowns"],
+    slopes: Float[np.ndarray, "rows n unknowns"] | None = None,
 ) -> Linearised:
-    """Predictions and slopes, compared with measurements and priors; without a run."""
+    """Predictions, and slopes if they are known, compared with measurements and priors; without a run."""
+    slopes = np.zeros((*prediction.shape, coordinates.shape[1])) if slopes is None else slopes
     residual, by_prediction, root = compared(density.measurements, prediction)
     prior, by_coordinate = map(np.asarray, density.problem.unknowns.prior_residuals(jnp.asarray(coordinates, float)))
     of_all = (np.concatenate([factor[..., None] * slopes, by_coordinate], axis=1) for factor in (by_prediction, root))
-    return Linearised(prediction, slopes, np.concatenate([residual, prior], axis=1), *of_all)
-
-
-def deviances(
-    density: "LogDensity", coordinates: Rows, prediction: Float[np.ndarray, "rows n"]
-) -> Float[np.ndarray, " rows"]:
-    """-2 log posterior in every row, up to a constant, from the predictions of the rows."""
-    return weighed(density, coordinates, prediction, np.zeros((*prediction.shape, coordinates.shape[1]))).deviance
+    return Linearised(coordinates, prediction, slopes, np.concatenate([residual, prior], axis=1), *of_all)
 
 
 def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]) -> list[np.ndarray]:
@@ -751,10 +742,6 @@ class LogDensity(eqx.Module):
     def __call__(self, coordinates: Float[Array | np.ndarray, " unknowns"]) -> Float[Array, ""]:
         return self.of_prediction(jnp.asarray(coordinates), self.predict(jnp.asarray(coordinates)[None])[0])
 
-    def log_priors(self, coordinates: Float[Array | np.ndarray, "rows unknowns"]) -> Float[Array, " rows"]:
-        """The log prior densities at several sets of coordinates."""
-        return self.problem.unknowns.log_priors(coordinates[:, : len(self.problem.names)])
-
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
         """The log density at given coordinates, for given predictions of the model."""
         log_prior = self.problem.unknowns.log_prior(coordinates)
@@ -769,14 +756,15 @@ class LogDensity(eqx.Module):
 
     def with_errors(self, errors: Float[Array | np.ndarray, " n"]) -> "LogDensity":
         """The density for measurements with other errors."""
-        return eqx.tree_at(lambda density: density.measurements, self, self.measurements.with_errors(errors))
+        errors = jnp.broadcast_to(errors, self.measurements.error.shape)
+        return eqx.tree_at(lambda density: density.measurements.error, self, errors)
 
     def _with_errors(self, coordinates: Float[Array, " unknowns"]) -> Measurements:
         errors = self.measurements.error
         for coordinate, series in zip(coordinates[len(self.problem.names) :], self.open_series, strict=True):
             mask = self.measurements.estimated & (self.measurements.series == series)
             errors = jnp.where(mask, errors * jnp.exp(coordinate), errors)
-        return self.measurements.with_errors(errors)
+        return self.with_errors(errors).measurements
 
 
 @eqx.filter_jit

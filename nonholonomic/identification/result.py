@@ -440,14 +440,14 @@ def identify(
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
     with status_line("fitting", progress):
         density = LogDensity.of(model, measurements, free, slopes=slopes)
-        return most_likely(density, labels, starts, spread, seed, max_steps, progress)
+        return most_likely(density, labels, starts, spread, seed, max_steps)
 
 
 def most_likely(
-    density: LogDensity, labels: tuple[str, ...], starts: int, spread: float, seed: int, max_steps: int, progress: bool
+    density: LogDensity, labels: tuple[str, ...], starts: int, spread: float, seed: int, max_steps: int
 ) -> Identification:
     """The parameters of greatest density. **Arguments:** as for `identify`, checked."""
-    explorer, minima, sample = search(Explorer.of(density, spread, seed), starts, max_steps, progress)
+    explorer, minima, sample = search(Explorer.of(density, spread, seed), starts, max_steps)
     result = summarise(labels, minima, explorer, sample)
     if not result.verdict.good:
         warn("; ".join(result.verdict.concerns), FitWarning)
@@ -620,7 +620,7 @@ def sample(
         known = Mixture(np.ones(1), np.asarray(centre, float)[None], np.linalg.cholesky(covariance)[None])
     with status_line("sampling", progress):
         sizes = (chains, MOVES * warmup, draws)
-        coordinates, accepted, runs, excess = drawn(density, known, sizes, seed, progress)
+        coordinates, accepted, runs, excess = drawn(density, known, sizes, seed)
     with status_line("diagnosing the draws", progress):
         posterior = Draws.of(density, coordinates, accepted, runs, excess)
     if words := (*(f"these are no draws from the posterior: {flaw}" for flaw in posterior.flaws), *posterior.concerns):
@@ -629,7 +629,7 @@ def sample(
 
 
 def drawn(
-    density: LogDensity, known: Mixture | None, sizes: tuple[int, int, int], seed: int, progress: bool
+    density: LogDensity, known: Mixture | None, sizes: tuple[int, int, int], seed: int
 ) -> tuple[Float[np.ndarray, "chains draws unknowns"], float, int, float]:
     """Coordinates of draws, the fraction of accepted proposals, the number of runs, and the excess of the log density at the
     start over the median of the draws.
@@ -639,7 +639,7 @@ def drawn(
     """
     chains, discarded, draws = sizes
     explorer, random = Explorer.of(density, SPREAD, seed), np.random.default_rng(seed)
-    explorer, minima, explored = search(explorer, STARTS, STEPS, progress)
+    explorer, minima, explored = search(explorer, STARTS, STEPS)
     components = minima.components
     if known is not None:
         components = known if components is None else components.joined(known, 0.5)

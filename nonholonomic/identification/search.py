@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 from ..terminal import Progress
 from ..validation import warn
 from .exploration import FALL, Explorer, Mixture, Pool
-from .posterior import Linearised, LogDensity, deviances, estimated_errors, linearise, predictions, weighed
+from .posterior import Linearised, LogDensity, Rows, estimated_errors, linearise, predictions, weighed
 from .recording import AbstractRecording
 
 #: Damping of the first step, as a fraction of the squared slope with respect to each coordinate.
@@ -52,11 +52,10 @@ ROUND_OFF = 1e-7
 
 def minimise(
     density: LogDensity,
-    starts: Float[np.ndarray, "rows unknowns"],
+    starts: Rows,
     *,
     fixed: int | None = None,
     max_steps: int = 60,
-    progress: bool = False,
 ) -> "Minima":
     """Fit every row.
 
@@ -66,19 +65,17 @@ def minimise(
     - `starts`: coordinates, (rows, unknowns).
     - `fixed`: index of an unknown that keeps its start value, or `None`.
     - `max_steps`: a row that needs more steps has not converged.
-    - `progress`: whether to show, on a terminal or in a notebook, how many rows are done.
 
     **Returns:** the `Minima`.
     """
     starts = np.asarray(starts, float)
-    coordinates = starts.copy()
-    count, unknowns = coordinates.shape
+    count, unknowns = starts.shape
     moving = np.array([k for k in range(unknowns) if k != fixed], int)
     of_unknowns = density.problem.unknowns
     is_bounded = np.isfinite(of_unknowns.lower) | np.isfinite(of_unknowns.upper)
     reach = np.where(is_bounded, FARTHEST, np.inf)[moving]
-    with Progress(count, "fit", shown=progress) as display:
-        current = linearise(density, coordinates)
+    with Progress(count, "fit") as display:
+        current = linearise(density, starts)
         display.begin()
         scale, damping = np.zeros((count, len(moving))), np.full(count, FIRST_DAMPING)
         free = max(current.residual.shape[1] - len(moving), 1)
@@ -96,13 +93,13 @@ def minimise(
             move = -np.linalg.solve(damped, slope[..., None])[..., 0]
             move = move / np.maximum(1.0, np.max(np.abs(move) / reach, axis=1, keepdims=True))
             predicted_gain = -np.einsum("ri,rij,rj->r", move, squares, move) - 2.0 * np.sum(move * slope, axis=1)
-            trial_coordinates = coordinates.copy()
-            trial_coordinates[:, moving] += move
-            trial = linearise(density, trial_coordinates, ~converged)
+            coordinates = current.coordinates.copy()
+            coordinates[:, moving] += move
+            trial = linearise(density, coordinates, ~converged)
             gain = current.deviance - trial.deviance
             improves = ~converged & (gain > 0.0)
             damping = np.where(improves, np.where(gain > GOOD * predicted_gain, EASED, 1.0), HARDENED) * damping
-            coordinates, current = chosen(improves, (trial_coordinates, trial), (coordinates, current))
+            current = chosen(improves, trial, current)
             history.append(current.deviance)
             remaining_gain = _promise(current, moving)
             ended = (remaining_gain < CONVERGED) | (~improves & (remaining_gain < NEGLIGIBLE))
@@ -111,7 +108,7 @@ def minimise(
                 ended |= history[-1 - PATIENCE] - current.deviance < STALLED * excess
             display.advance(int(np.sum(ended & ~converged)), steps=step)
             converged |= ended
-    return Minima(starts, coordinates, converged, current, density)
+    return Minima(starts, converged, current, density)
 
 
 def chosen(improves: Bool[np.ndarray, " rows"], new: PyTree, old: PyTree) -> PyTree:
@@ -243,15 +240,19 @@ SAME, CLOSE = 0.1, 0.5
 class Minima(NamedTuple):
     """The ends of least-squares fits, a row each.
 
-    - `starts`, `coordinates`: (rows, unknowns), where each began and ended; `converged`: (rows,).
+    - `starts`: (rows, unknowns), where each began; `converged`: (rows,).
     - `linearised`: model and likelihood at the ends; `density`: with the errors that were estimated at the best end.
     """
 
-    starts: Float[np.ndarray, "rows unknowns"]
-    coordinates: Float[np.ndarray, "rows unknowns"]
+    starts: Rows
     converged: Bool[np.ndarray, " rows"]
     linearised: Linearised
     density: LogDensity
+
+    @property
+    def coordinates(self) -> Rows:
+        """Where each fit ended, (rows, unknowns)."""
+        return self.linearised.coordinates
 
     @property
     def deviance(self) -> Float[np.ndarray, " rows"]:
@@ -286,10 +287,10 @@ class Minima(NamedTuple):
         density = other.density if is_better else self.density
         pair = self.weighed(density), other.weighed(density)
         order = np.argsort(np.concatenate([minima.deviance for minima in pair]), kind="stable")[: len(self.starts)]
-        ends = jax.tree.map(lambda *parts: np.concatenate(parts)[order], *(minima[:4] for minima in pair))
+        ends = jax.tree.map(lambda *parts: np.concatenate(parts)[order], *(minima[:3] for minima in pair))
         return Minima._make((*ends, density))
 
-    def between(self) -> Float[np.ndarray, "rows unknowns"]:
+    def between(self) -> Rows:
         """Points between the best end and the others, and beyond it, the nearest first.
 
         Minima of periodic motions lie at equal distances: where two are known, there may be one in the middle, or at the
@@ -338,9 +339,8 @@ class Minima(NamedTuple):
 
 def refine(
     density: LogDensity,
-    starts: Float[np.ndarray, "rows unknowns"],
+    starts: Rows,
     max_steps: int,
-    progress: bool,
     in_parts: bool = False,
 ) -> Minima:
     """Fit every row, and estimate unknown errors from the residuals of the best.
@@ -352,18 +352,17 @@ def refine(
     if in_parts:
         duration = float(np.max(np.asarray(measurements.time)))
         steps, coordinates = min(max_steps, AT_ONCE), starts
-        minima = minimise(density, starts, max_steps=steps, progress=progress)
+        minima = minimise(density, starts, max_steps=steps)
         for part in PARTS:
             # Later measurements have nearly no weight.
             factor = jnp.where(measurements.time > part * duration, DOWN_WEIGHTED, 1.0)
             early = density.with_errors(measurements.error * factor)
-            coordinates = minimise(early, coordinates, max_steps=min(max_steps, OF_PART), progress=progress).coordinates
-        by_parts = minimise(density, coordinates, max_steps=2 * steps, progress=progress)
+            coordinates = minimise(early, coordinates, max_steps=min(max_steps, OF_PART)).coordinates
+        by_parts = minimise(density, coordinates, max_steps=2 * steps)
         improves = by_parts.linearised.deviance < minima.linearised.deviance
-        coordinates, converged, linearised = chosen(improves, by_parts[1:4], minima[1:4])
-        minima = Minima(minima.starts, coordinates, converged, linearised, density)
+        minima = Minima._make((starts, *chosen(improves, by_parts[1:3], minima[1:3]), density))
     else:
-        minima = minimise(density, starts, max_steps=max_steps, progress=progress)
+        minima = minimise(density, starts, max_steps=max_steps)
     for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
         best = minima.linearised.prediction[np.argmin(minima.linearised.deviance)]
         errors = estimated_errors(density.measurements, best, starts.shape[1])
@@ -372,7 +371,7 @@ def refine(
         if change <= SETTLED:
             minima = minima.weighed(density)
             break
-        minima = minimise(density, minima.coordinates, max_steps=max_steps, progress=progress)
+        minima = minimise(density, minima.coordinates, max_steps=max_steps)
     return minima._replace(starts=np.asarray(starts))
 
 
@@ -408,7 +407,7 @@ LAST = 4
 IMPROVED = 0.1
 
 
-def search(explorer: Explorer, starts: int, max_steps: int, progress: bool) -> tuple[Explorer, Minima, Pool]:
+def search(explorer: Explorer, starts: int, max_steps: int) -> tuple[Explorer, Minima, Pool]:
     """Compare candidates, refine the best, and explore the likelihood around all minima; or explore first, where steps by
     differences cost more. **Arguments:** as for `identify`.
 
@@ -444,11 +443,11 @@ def search(explorer: Explorer, starts: int, max_steps: int, progress: bool) -> t
     is_bounded = len(problem.names) == 1 and bool(np.all(pool.log_density[[0, -1]] < np.max(pool.log_density) - FALL))
     if problem.step is not None and (recorded or is_bounded):
         # A step by differences takes as long as a round of the exploration, which also finds the minima.
-        sample = explorer.explore(pool, None, progress)
+        sample = explorer.explore(pool, None)
         place = sample.most_probable(min(starts, LAST if recorded else 1))
         best = sample.points[place]
         if recorded or not sample.enough or np.any(np.asarray(measurements.estimated)):
-            return explorer, refine(density, best, steps, progress), sample
+            return explorer, refine(density, best, steps), sample
         # Among so many points of a single unknown, the best is close to the minimum, and those around it show the slopes.
         beside = best[0] + problem.step * np.array([-1.0, 1.0])
         moved = [np.interp(beside, sample.points[:, 0], column) for column in sample.predictions.T]
@@ -456,21 +455,21 @@ def search(explorer: Explorer, starts: int, max_steps: int, progress: bool) -> t
             slopes = np.diff(moved)[None] / (2.0 * problem.step)
         slopes = np.where(np.isfinite(slopes) & acts, slopes, 0.0)
         at_best = weighed(density, best, sample.predictions[place], slopes)
-        return explorer, Minima(best, best, np.array([True]), at_best, density), sample
+        return explorer, Minima(best, np.array([True]), at_best, density), sample
     # The start; then, in turn, the best for all measurements and for the early ones.
     start = int(np.argmin(np.sum((pool.points - explorer.region.middle) ** 2, axis=1)))
     totals = np.cumsum(pool.groups, axis=1) + pool.log_prior[:, None]
     columns = sorted({totals.shape[1] - 1, *(totals.shape[1] * part // 8 for part in (0, 1, 2, 4))}, reverse=True)
     ranked = np.stack([np.argsort(-totals[:, column]) for column in columns], axis=1).reshape(-1)
     candidates = pool.points[list(dict.fromkeys([start, *ranked.tolist()]))[:starts]]
-    minima = refine(density, candidates, steps, progress, in_parts=recorded)
+    minima = refine(density, candidates, steps, in_parts=recorded)
     if recorded:
-        later = refine(minima.density, minima.between(), min(max_steps, BETWEEN), progress)
+        later = refine(minima.density, minima.between(), min(max_steps, BETWEEN))
         minima = minima.joined(later)
     # Along a direction without any slope, the likelihood has no end that an exploration could find.
     has_end = bool(np.all(np.isfinite(minima.covariance(minima.best))))
-    sample = explorer.explore(pool, minima.components, progress) if has_end else pool
-    return explorer, _improved(minima, sample, max_steps, progress), sample
+    sample = explorer.explore(pool, minima.components) if has_end else pool
+    return explorer, _improved(minima, sample, max_steps), sample
 
 
 def _refuse_milliseconds(explorer: Explorer, pool: Pool | None) -> None:
@@ -511,22 +510,22 @@ def _refuse_milliseconds(explorer: Explorer, pool: Pool | None) -> None:
         )
 
 
-def _improved(minima: Minima, sample: Pool, max_steps: int, progress: bool) -> Minima:
+def _improved(minima: Minima, sample: Pool, max_steps: int) -> Minima:
     """The minima, the best of them refined to the end; or those of the best points of the exploration, if these are better."""
     density, count = minima.density, min(LAST, len(minima.starts))
     order = sample.most_probable(count)
-    deviance = deviances(density, sample.points[order], sample.predictions[order])
+    deviance = weighed(density, sample.points[order], sample.predictions[order]).deviance
     if np.min(deviance) < np.min(minima.deviance) - IMPROVED:
-        later = refine(density, sample.points[order], min(max_steps, FEW_STEPS), progress)
+        later = refine(density, sample.points[order], min(max_steps, FEW_STEPS))
         is_better = np.min(later.weighed(density).deviance) < np.min(minima.deviance)
         return minima.joined(later) if is_better else minima
     if minima.converged[minima.best]:
         return minima
     rows = np.argsort(minima.deviance)[:count]
-    later = refine(density, minima.coordinates[rows], max_steps, progress)
+    later = refine(density, minima.coordinates[rows], max_steps)
     # The rows that were fitted further replace the old ones.
     place = np.arange(len(minima.starts))
     place[rows] = len(place) + np.arange(count)
-    pair = minima.weighed(later.density)[1:4], later[1:4]
-    coordinates, converged, linearised = jax.tree.map(lambda old, new: np.concatenate([old, new])[place], *pair)
-    return Minima(minima.starts, coordinates, converged, linearised, later.density)
+    pair = minima.weighed(later.density)[1:3], later[1:3]
+    ends = jax.tree.map(lambda old, new: np.concatenate([old, new])[place], *pair)
+    return Minima._make((minima.starts, *ends, later.density))

@@ -552,7 +552,7 @@ def fit_runs(
     argument -> value; `slopes`: "exact" or "differences", by default as the model requires.
     """
     check_search(**search)
-    with status_line("fitting", search["progress"]):
+    with status_line("fitting", search.pop("progress")):
         density = posterior_of_runs(system, data, free, None, expected, tolerance, slopes)
         sources = density.problem.model.data
         return most_likely(density, numbered([source.data.labels for source in sources]), **search)

@@ -1,9 +1,10 @@
 """The file of a table, finished or not.
 
 A table's file is HDF5 with dimension scales, as in netCDF-4, so that xarray opens it with named coordinates. Words, such as
-a cell's status, are stored as bytes with the attributes `flag_values` and `flag_meanings` (CF conventions). Checksums
-cover every number: HDF5 has one for the description of the arrays, and the group `checksums`, which xarray does not
-show, has one for each chunk of each variable. A file appears only when it is complete.
+a cell's status, are stored as bytes with the attributes `flag_values` and `flag_meanings` (CF conventions). This package reads
+only the numbers, and the layout of the table from an attribute of the group `checksums`, which xarray does not show. Checksums
+cover everything: HDF5 has one for the description of the arrays, and the group has one for each chunk of each variable. A file
+appears only when it is complete.
 
 A sweep fills a file in a folder beside it, chunk by chunk, so that a killed sweep can resume. The file has room for all
 numbers from the beginning, and HDF5 never writes it again. A chunk is finished when it is marked so, in one byte, after its
@@ -21,7 +22,7 @@ import shutil
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, cast
+from typing import IO, TYPE_CHECKING, cast
 
 try:
     import fcntl
@@ -30,7 +31,6 @@ except ImportError:  # not a POSIX system
 
 import numpy as np
 
-from ..integration.problem import FORMER_WORDS
 from ..validation import as_path, real_path, replacing, sync_folder, warn
 from .grid import EQUATIONS, PENDING, Layout, Values, axes_of
 
@@ -43,8 +43,8 @@ CHECKSUMS = "checksums"
 #: The array of a byte for each chunk, in the same group: not 0 when the chunk is finished.
 FINISHED = "finished chunks"
 
-#: Attributes that describe the file and not its table; earlier versions wrote the last two.
-OF_THE_FILE = ("Conventions", "inner", "long_names")
+#: The attribute of this group with the layout of the table.
+LAYOUT = "layout"
 
 #: Variables of tables larger than this [bytes] are read only when needed.
 MAX_BYTES_IN_MEMORY = 1 << 27
@@ -155,12 +155,13 @@ def _describe(stream: Stream, layout: Layout) -> dict[str, int]:
         for name, value in (layout.attributes | {"Conventions": "CF-1.10"}).items():
             _set(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
         checksums = file.create_group(CHECKSUMS)
-        checksums.attrs["block"] = layout.chunk
-        meanings = dict(layout.words)
+        words = {name: values.tolist() for name, values in layout.coords.items() if values.dtype.kind == "U"}
+        names = {"coords": dict.fromkeys(layout.coords) | words, "kinds": list(layout.kinds)}
+        _set(checksums, LAYOUT, json.dumps(layout._asdict() | names))
+        meanings = layout.words | words
         for name, values in layout.coords.items():
-            if values.dtype.kind == "U":
-                meanings[name], values = tuple(values.tolist()), np.arange(len(values), dtype=np.int8)
-            scale = file.create_dataset(name, data=values)
+            codes = np.arange(len(values), dtype=np.int8)
+            scale = file.create_dataset(name, data=codes if name in words else values)
             scale.make_scale(name)
             checksums.create_dataset(name, data=np.array([zlib.crc32(scale[()])], "<u4"))
         for name, kind in layout.kinds.items():
@@ -177,7 +178,7 @@ def _describe(stream: Stream, layout: Layout) -> dict[str, int]:
                 file[name].attrs["flag_values"] = np.arange(len(meanings[name]), dtype=np.int8)
                 text = " ".join(meanings[name])
                 if text.split() != list(meanings[name]):
-                    raise ValueError(f"the words of {name} must not have spaces or be empty: {meanings[name]}")
+                    raise ValueError(f"the words of {name} must not have spaces or be empty: {tuple(meanings[name])}")
                 _set(file[name], "flag_meanings", text)
             else:
                 _set(file[name], "units", layout.units.get(name, "1"))
@@ -215,15 +216,6 @@ def _places(file: "h5py.File") -> dict[str, int]:
     return places
 
 
-def _attribute(node: "h5py.HLObject", name: str, is_text: bool = False) -> Any:
-    """An attribute, a number or a string. **Arguments:** `is_text`: whether it must be a string."""
-    value = node.attrs[name]
-    value = value.decode() if isinstance(value, bytes) else value
-    if is_text and not isinstance(value, str):
-        raise ValueError(f"the attribute {name} is not a text")
-    return value
-
-
 class Stored(Mapping[str, Values]):
     """The variables of a table that stays in its file: each is read, and checked against its checksums, when needed.
 
@@ -244,15 +236,13 @@ class Stored(Mapping[str, Values]):
             raise FileNotFoundError(f"no such file: {path}")
         if self.path.is_dir():
             raise OSError(f"cannot read {self._title}: it is a folder")
-        reason = "it is not a table of nonholonomic, or it is damaged"
         try:
             with h5py.File(self.path, "r") as file:
-                if is_unfinished and FINISHED not in cast("h5py.Group", file[CHECKSUMS]):
-                    reason = "an earlier version began this table; resume with that version, or remove the folder"
                 self.layout, self._sums, self.places = _contents(file)
         # What a damaged file makes HDF5 and NumPy raise can be of any kind.
         except Exception as error:
-            raise OSError(f"cannot read {self._title}: {reason} ({error or type(error).__name__})") from None
+            reason = f"it is not a table of nonholonomic, or it is damaged ({error or type(error).__name__})"
+            raise OSError(f"cannot read {self._title}: {reason}") from None
         self.finished = set(np.flatnonzero(self._sums[FINISHED]).tolist())
 
     def __getitem__(self, name: str) -> Values:
@@ -307,50 +297,27 @@ class Stored(Mapping[str, Values]):
 
 def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values], dict[str, int]]:
     """A file's layout, its checksums, and where the numbers of its variables are."""
-    coords, kinds, units, words, inner, shapes, long_names = {}, {}, {}, {}, {}, {}, {}
-    if "request" not in file.attrs:
-        raise ValueError("it names no request")
-    attributes = {name: _attribute(file, name) for name in file.attrs if name not in OF_THE_FILE}
-    for name in ("request", "versions"):
-        if not isinstance(json.loads(attributes.get(name, "{}")), dict):
-            raise ValueError(f"the attribute {name} is not a dictionary")
-    axes, checksums = json.loads(attributes["axes"]), cast("h5py.Group", file[CHECKSUMS])
-    places = _places(file)
+    arrays, checksums = cast("dict[str, h5py.Dataset]", file), cast("h5py.Group", file[CHECKSUMS])
+    if LAYOUT not in checksums.attrs:
+        raise ValueError("another program wrote it, or an earlier version, which can resume it")
+    fields, places = json.loads(cast(bytes, checksums.attrs[LAYOUT])), _places(file)
     # The marks first: a sweep may finish a chunk meanwhile, which would then have its new mark and its old checksum.
     sums = {name: np.asarray(checksums[name]) for name in sorted(checksums, key=lambda name: name != FINISHED)}
-    for name in (*axes, *(name for name in map(str, file) if name not in (*axes, CHECKSUMS))):
-        array = cast("h5py.Dataset", file[name])
-        if "long_name" in array.attrs:
-            long_names[name] = _attribute(array, "long_name", is_text=True)
-        if "flag_meanings" in array.attrs:
-            meanings = _attribute(array, "flag_meanings", is_text=True).split()
-            # Words of earlier versions are converted to current ones.
-            former = FORMER_WORDS if name == "status" else {}
-            words[name] = tuple(former.get(word, word) for word in meanings)
-        else:
-            units[name] = _attribute(array, "units", is_text=True)
-        if array.is_scale:
-            coords[name] = np.asarray(array)
-            if coords[name].ndim != 1:
-                raise ValueError(f"{name} is not a list of numbers")
-            if [zlib.crc32(coords[name])] != sums[name].tolist():
-                raise ValueError(f"{name} does not match its checksum")
-        else:
-            kinds[name], shapes[name] = array.dtype, array.shape
-            if dims := list(array.dims)[len(axes) :]:
-                inner[name] = tuple(str(dim[0].name).removeprefix("/") for dim in dims)
-    # The dimensions of a variable that a user has left out belong to no variable.
-    used = {*axes, *(dim for dims in inner.values() for dim in dims)}
-    coords = {name: values for name, values in coords.items() if name in used}
-    coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
-    layout = Layout(coords, kinds, units, attributes, words, inner, int(_attribute(checksums, "block")), long_names)
-    if layout.chunk < 1:
-        raise ValueError(f"its chunks have {layout.chunk} cells")
-    # Files of earlier versions hold finished tables alone.
-    sums.setdefault(FINISHED, np.ones(layout.chunks, np.uint8))
+    coords = {}
+    for name, words in fields["coords"].items():
+        numbers = np.asarray(arrays[name])
+        if [zlib.crc32(numbers.data)] != sums[name].tolist():
+            raise ValueError(f"{name} does not match its checksum")
+        coords[name] = numbers if words is None else np.array(words)
+    kinds = {name: arrays[name].dtype for name in fields["kinds"]}
+    tuples = {part: {name: tuple(words) for name, words in fields[part].items()} for part in ("words", "inner")}
+    layout = Layout(**fields | tuples | {"coords": coords, "kinds": kinds})
+    for name in ("request", "versions"):
+        if not isinstance(json.loads(layout.attributes.get(name, "{}")), dict):
+            raise ValueError(f"the attribute {name} is not a dictionary")
     for name in (*kinds, FINISHED):
         shape = layout.shape + layout.inner_shape(name)
-        if shapes.get(name, shape) != shape or len(sums[name]) != layout.chunks:
+        if len(sums[name]) != layout.chunks or (name in kinds and arrays[name].shape != shape):
             raise ValueError(f"{name} has the wrong shape")
     return layout, sums, places
 
@@ -436,9 +403,8 @@ class ChunkStore:
                 versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in changed)
                 warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning)
             # The table records the versions with which it was begun.
-            self.layout = tables[0].layout._replace(words=self.layout.words)
-        begun = [(table.path, table.layout.words) for table in tables]
-        if begun != [(self._unfinished, self.layout.words)]:
+            self.layout = tables[0].layout
+        if [table.path for table in tables] != [self._unfinished]:
             self._begin(tables)
         unfinished = Stored(self.path, is_unfinished=True)
         # A chunk that could be read only the first time is not in a new file.
@@ -593,7 +559,7 @@ def contents_of(path: Path) -> tuple[Layout, Mapping[str, Values]]:
 
 def difference_between(old: Layout, new: Layout) -> str | None:
     """How the table in a file differs from the one to compute, in words; `None` if both are results of one request."""
-    in_file, in_call = (json.loads(layout.attributes["request"]) for layout in (old, new))
+    in_file, in_call = (json.loads(layout.attributes.get("request", "{}")) for layout in (old, new))
     if "status" in in_file:
         return "it is a single run, not a table of many"
     texts = [layout.versions.get("nonholonomic") for layout in (old, new)]
@@ -617,11 +583,7 @@ def difference_between(old: Layout, new: Layout) -> str | None:
     if (old.kinds, old.inner, old.chunk) != (new.kinds, new.inner, new.chunk):
         return f"it was not written by a sweep in {new.chunks} chunks"
     for name in new.kinds:
-        # Those of the file have been converted.
-        former = FORMER_WORDS if name == "status" else {}
-        words = [[former.get(word, word) for word in layout.words.get(name, ())] for layout in (old, new)]
-        # Words may have been added since.
-        if words[0] != words[1][: len(words[0])]:
-            texts = [repr(", ".join(listed)) for listed in words]
+        if old.words.get(name) != new.words.get(name):
+            texts = [repr(", ".join(layout.words.get(name, ()))) for layout in (old, new)]
             return f"the words of {name} are {texts[0]} in the file and {texts[1]} here"
     return None

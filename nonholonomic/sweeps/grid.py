@@ -189,7 +189,7 @@ def size_of(axes: list[Axis]) -> int:
     >>> size_of(axes)
     4
     """
-    return int(np.prod([len(axis.values) for axis in axes], dtype=int))
+    return math.prod(len(axis.values) for axis in axes)
 
 
 def columns(axes: list[Axis], first: int, count: int) -> dict[str, Values]:

@@ -291,17 +291,16 @@ def computed(
     """Compute the unfinished chunks, and yield each when it is finished; see `sweep`."""
     todo = [chunk for chunk in range(layout.chunks) if chunk not in finished]
     finished_cells = layout.cells - sum(map(layout.size, todo))
-    with Progress(layout.cells, "cell", shown=progress) as display, workforce(work, executor) as submit:
-        is_compiled = executor is None
-        if is_compiled:
+    with Progress(layout.cells, "cell", shown=progress) as display, contextlib.ExitStack() as stack:
+        is_compiled, pool = executor is None, executor
+        if pool is None:
+            pool = ThreadPoolExecutor(workers())
+            stack.callback(pool.shutdown, wait=False, cancel_futures=True)
             if todo:
                 # In another thread, so that this one receives Ctrl-C: XLA compiles for many seconds without checking.
-                pool = ThreadPoolExecutor(1)
-                try:
-                    pool.submit(work.compile).result()
-                finally:
-                    pool.shutdown(wait=False)
+                pool.submit(work.compile).result()
             display.begin(finished_cells)
+        submit = submission(work, pool)
         try:
             for chunk, values in handed_out(lambda chunk: submit(chunk * layout.chunk, layout.chunk), todo, HANDED_OUT):
                 yield chunk, failed_chunk(work.axes, layout, chunk) if values is None else values
@@ -336,31 +335,21 @@ def layout_of(
     return Layout(coords, kinds, units, attributes, words, dims, chunk, long_names)
 
 
-@contextlib.contextmanager
-def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[int, int], Future]]:
+def submission(work: ChunkTask, executor: Executor) -> Callable[[int, int], Future]:
     """A function that submits the computation of `count` cells, starting with cell `first`.
 
     Threads share this process and its compiled programs. Other executors receive all data that they need.
     """
-    if executor is None:
-        pool = ThreadPoolExecutor(workers())
-        try:
-            yield functools.partial(pool.submit, work.results)
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-    elif isinstance(executor, ThreadPoolExecutor):
-        yield functools.partial(executor.submit, work.results)
-    else:
-        try:
-            payload, versions_here = pickle.dumps(work), stamp()
-        except (pickle.PicklingError, AttributeError, TypeError) as error:
-            raise ValueError(
-                f"executor: the work cannot be sent to another process ({error}); a function in it must be defined at the top "
-                "of a module, not inside another function and not as a lambda"
-            ) from None
-        yield lambda first, count: executor.submit(
-            remote_results, payload, versions_here, first, count, uuid.uuid4().hex
-        )
+    if isinstance(executor, ThreadPoolExecutor):
+        return functools.partial(executor.submit, work.results)
+    try:
+        payload, versions_here = pickle.dumps(work), stamp()
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"executor: the work cannot be sent to another process ({error}); a function in it must be defined at the top "
+            "of a module, not inside another function and not as a lambda"
+        ) from None
+    return lambda first, count: executor.submit(remote_results, payload, versions_here, first, count, uuid.uuid4().hex)
 
 
 def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Values]:

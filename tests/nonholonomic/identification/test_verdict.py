@@ -140,7 +140,7 @@ def test_the_better_of_two_searches_is_that_of_the_smaller_residuals(seed, swapp
     value = np.sin(6.0 * T) + 0.5 * np.random.default_rng(seed).normal(size=T.size)
     data = Measurements(value, 1.0, estimated=True)
     density = LogDensity.of(oscillation, data, {"height": Free(1.0), "rate": Free(6.0)})
-    near, far = (refine(density, np.array([[1.0, rate]]), 60, False) for rate in (0.0, 1.0))
+    near, far = (refine(density, np.array([[1.0, rate]]), 60) for rate in (0.0, 1.0))
     scatter = [np.std(value - minima.linearised.prediction[0]) for minima in (near, far)]
     assert scatter[0] < 0.8 * scatter[1]
     both = far.joined(near) if swapped else near.joined(far)

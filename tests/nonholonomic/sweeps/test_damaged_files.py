@@ -1,6 +1,7 @@
 """Files that are cut, changed or foreign: no wrong number read, none of another's bytes changed."""
 
 import errno
+import json
 import os
 import resource
 import shutil
@@ -162,21 +163,21 @@ def test_an_unreadable_block_alone_is_computed_again(error, tmp_path, monkeypatc
         assert len(resumed(path)) == (4 if is_unfinished else 0)
 
 
-def test_a_table_that_an_earlier_version_began_is_refused_by_this_reason(tmp_path):
-    """Its file had no numbers, and each of its chunks was a file."""
+def test_files_of_earlier_versions_are_refused_by_this_reason(tmp_path):
+    """They have no layout; in some, each chunk was a file beside an unfinished table."""
     path, folder = tmp_path / "table.h5", tmp_path / "table.h5.blocks"
+    whole = tmp_path / "whole.h5"
     half_finished(path)
-    with h5py.File(folder / "table.h5", "r+") as file:
-        del file["checksums/finished chunks"]
-        for name in VARIABLES:
-            values = file[name]
-            del file[name]
-            file.create_dataset(name, shape=values.shape, dtype=values.dtype)
+    cheap_sweep(whole)
+    for file_path in (folder / "table.h5", whole):
+        with h5py.File(file_path, "r+") as file:
+            del file["checksums"].attrs["layout"]
     (folder / "0.npz").touch()
-    text = rf"cannot read {path}, unfinished in {folder}: an earlier version began this table; resume with that version, or"
-    for read in (Table.load, lambda path: cheap_sweep(path, pytest.fail)):
-        with pytest.raises(OSError, match=text):
-            read(path)
+    for table_path, place in ((path, f"{path}, unfinished in {folder}"), (whole, f"{whole}")):
+        text = rf"cannot read {place}: .* \(another program wrote it, or an earlier version, which can resume it\)"
+        for read in (Table.load, lambda path: cheap_sweep(path, pytest.fail)):
+            with pytest.raises(OSError, match=text):
+                read(table_path)
     assert sorted(file.name for file in folder.iterdir()) == ["0.npz", "table.h5"]
 
 
@@ -337,8 +338,11 @@ def test_a_full_disk_leaves_no_half_file(tmp_path):
 def hostile_files():
     """Changes of a file with right checksums, each of which another program could have written."""
 
+    def of_layout(file, **changes):
+        file["checksums"].attrs["layout"] = json.dumps(json.loads(file["checksums"].attrs["layout"]) | changes)
+
     def no_cells_in_a_chunk(file):
-        file["checksums"].attrs["block"] = 0
+        of_layout(file, chunk=0)
 
     def more_numbers_than_fit(file):
         del file["value"]
@@ -353,10 +357,10 @@ def hostile_files():
         file["checksums"]["status"][0] = zlib.crc32(codes[:BLOCK].data)
 
     def words_of_another_kind(file):
-        file["status"].attrs["flag_meanings"] = np.arange(3)
+        of_layout(file, words={"status": 3})
 
     def a_request_of_another_kind(file):
-        file.attrs["request"] = "[1, 2]"
+        of_layout(file, attributes={"request": "[1, 2]"})
 
     def a_grid_in_place_of_an_axis(file):
         del file["x"]
@@ -364,16 +368,16 @@ def hostile_files():
         file["checksums"]["x"][0] = zlib.crc32(np.zeros((5, 10)))
 
     def too_deep(file):
-        file.attrs["axes"] = "[" * 30_000
+        file["checksums"].attrs["layout"] = "[" * 30_000
 
-    def a_unit_of_another_kind(file):
-        file["value"].attrs["units"] = 3.0
+    def another_shape(file):
+        of_layout(file, inner={"value": ["x"]})
 
     def a_loop(file):
         del file["value"]
         file["value"] = h5py.SoftLink("/value")
 
-    return [value for name, value in locals().items() if callable(value)]
+    return [value for name, value in locals().items() if callable(value) and value is not of_layout]
 
 
 @pytest.mark.parametrize("change", hostile_files(), ids=lambda change: change.__name__)

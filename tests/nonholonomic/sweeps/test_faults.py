@@ -292,19 +292,15 @@ def sweep_of_words(path, words, variable="status"):
     return sweep(job, [axis("x", "x", "s", X)], variables, {"what": "words"}, path=path, chunk=BLOCK, progress=False)
 
 
-@pytest.mark.parametrize(
-    ("variable", "words"),
-    [("status", ["low", "high"]), ("status", ("reached_end", "failed")), ("ending", ("reached_end", "failed"))],
-)
-def test_words_of_a_list_and_of_earlier_versions_resume(variable, words, tmp_path):
+@pytest.mark.parametrize(("variable", "words"), [("status", ["low", "high"]), ("ending", ("reached_end", "failed"))])
+def test_words_of_a_list_and_of_a_tuple_resume(variable, words, tmp_path):
     path = tmp_path / "table.h5"
     with pytest.MonkeyPatch.context() as patch:
         fail_on_disk(patch, FOR_THE_FOLDER + 8, torn=0.0, error=Killed())
         with pytest.raises(Killed):
             sweep_of_words(path, words, variable)
     table = sweep_of_words(path, words, variable)
-    right = ["completed" if (variable, word) == ("status", "reached_end") else word for word in words]
-    np.testing.assert_array_equal(table[variable], np.where(X > 0.5, right[1], right[0]))
+    np.testing.assert_array_equal(table[variable], np.where(X > 0.5, words[1], words[0]))
     np.testing.assert_array_equal(sweep_of_words(path, words, variable)[variable], table[variable])
 
 
