@@ -226,7 +226,7 @@ class Region(NamedTuple):
         return np.all(np.abs(points - self.middle) <= FARTHEST * self.half_width, axis=1)
 
 
-def region_of(density: LogDensity, spread: float, duration: float) -> Region:
+def region_of(density: LogDensity, spread: float) -> Region:
     """The region in which the unknowns of a density are searched.
 
     The range of an unknown is, by the first of these rules that applies:
@@ -241,8 +241,10 @@ def region_of(density: LogDensity, spread: float, duration: float) -> Region:
 
     Except for the first two rules, its middle is the start value.
 
-    **Arguments:** `spread`: greater than 1; `duration`: of the longest recording [s], 0 if there is none.
+    **Arguments:** `spread`: greater than 1.
     """
+    # 0 without recordings.
+    duration = float(np.max(np.asarray(density.measurements.time)))
     unknowns, names = density.problem.unknowns, map(own_name, density.problem.names)
     start, lower, upper = map(np.asarray, (unknowns.start, unknowns.lower, unknowns.upper))
     has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
@@ -366,11 +368,10 @@ class Explorer(NamedTuple):
     @classmethod
     def of(cls, density: LogDensity, spread: float, seed: int) -> "Explorer":
         """An explorer of the region around start values, as for `region_of`, with measurements grouped by their times."""
-        times = np.asarray(density.measurements.time)
-        distinct, duration = np.unique(times), float(np.max(times))
+        times, region = np.asarray(density.measurements.time), region_of(density, spread)
+        distinct = np.unique(times)
         count = min(GROUPS, len(distinct))
         group = (np.searchsorted(distinct, times) * count) // len(distinct)
-        region = region_of(density, spread, duration)
         rows = ROWS if len(region.middle) > 1 else ROWS // 8
         return cls(density, region, group, rows, seed, np.random.default_rng(seed))
 

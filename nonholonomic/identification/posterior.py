@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -441,17 +440,6 @@ class Problem(eqx.Module):
     on_host: bool = eqx.field(static=True)
     acts: Bool[np.ndarray, " unknowns"]
 
-    def __init__(
-        self,
-        model: Model,
-        free: Mapping[str, Free],
-        step: float | None = None,
-        priors: Mapping[str, Prior] = MappingProxyType({}),
-    ):
-        """**Arguments:** `priors`: name -> the prior of an unknown, as in `Unknowns`, in place of its own one."""
-        self.model, self.names, self.step, self.on_host = model, tuple(free), step, getattr(model, "on_host", False)
-        self.unknowns, self.acts = Unknowns(free, priors), np.ones(len(free), bool)
-
     def predict(self, coordinates: Float[Array | np.ndarray, "rows unknowns"]) -> Float[Array, "rows n"]:
         """The model's predictions in every row.
 
@@ -661,7 +649,8 @@ class LogDensity(eqx.Module):
         steps = {"exact": None, "differences": OF_RECORDING if recorded else DIFFERENCE}
         if not isinstance(slopes, str) or slopes not in steps:
             raise ValueError(f"slopes = {shown(slopes)} must be one of {', '.join(map(repr, steps))}")
-        problem = Problem(model, unknowns, steps[slopes], checked)
+        on_host, acts = getattr(model, "on_host", False), np.ones(len(unknowns), bool)
+        problem = Problem(model, tuple(unknowns), Unknowns(unknowns, checked), steps[slopes], on_host, acts)
         open_series = tuple(np.unique(series[estimated]).tolist())
         return cls(problem, measurements, open_series, series_units)
 

@@ -337,7 +337,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
     by_slopes = ends.covariance(best)
     # An undetermined number has an infinite variance, and its slope may vanish at a bound.
     with np.errstate(invalid="ignore"):
-        slope_covariance = np.where(by_slopes == 0.0, 0.0, by_slopes * np.outer(slopes, slopes))
+        slope_errors = np.sqrt(np.diag(by_slopes) * slopes**2)
     distribution = Distribution.of(optimum, by_slopes, sample)
     likely, covariance = problem.unknowns.values(optimum), distribution.covariance_of_values(problem, slopes)
     numbers = (measurements.value, measurements.error, linearised.prediction[best], linearised.residual[best, :count])
@@ -354,7 +354,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         standard_errors=by_name(np.sqrt(np.diag(covariance)).tolist()),
         covariance=covariance,
         most_likely=by_name(likely.tolist()),
-        slope_errors=by_name(np.sqrt(np.diag(slope_covariance)).tolist()),
+        slope_errors=by_name(slope_errors.tolist()),
         deviance=float(deviances[best]),
         degrees=linearised.residual.shape[1] - len(likely),
         identifiability=combinations,

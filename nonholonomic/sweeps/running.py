@@ -480,7 +480,7 @@ class LocalProcesses(Executor):
 
     def __init__(self, n: int, threads: int):
         """Set the number of processes and the number of cores for each."""
-        self._pools: list[ProcessPoolExecutor | None] = [None] * n
+        self._pools: dict[int, ProcessPoolExecutor] = {}
         self._threads = threads
         self._free: SimpleQueue[int] = SimpleQueue()
         for place in range(n):
@@ -498,19 +498,17 @@ class LocalProcesses(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes, after all calls, or after those that have begun."""
         self._callers.shutdown(wait, cancel_futures=cancel_futures)
-        for pool in self._pools:
-            if pool is not None:
-                pool.shutdown(wait, cancel_futures=cancel_futures)
+        for pool in self._pools.values():
+            pool.shutdown(wait, cancel_futures=cancel_futures)
 
     def _called(self, function: Callable[..., T], arguments: tuple[object, ...], options: dict[str, object]) -> T:
         place = self._free.get()
         try:
-            pool = self._pools[place]
-            if pool is None:
-                pool = self._pools[place] = _started(place, self._threads)
-            return pool.submit(function, *arguments, **options).result()
+            if place not in self._pools:
+                self._pools[place] = _started(place, self._threads)
+            return self._pools[place].submit(function, *arguments, **options).result()
         except BrokenProcessPool:
-            self._pools[place] = None
+            del self._pools[place]
             raise
         finally:
             self._free.put(place)

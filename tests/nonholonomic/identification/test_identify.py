@@ -238,7 +238,7 @@ def test_names_are_paths_or_their_ends():
 @pytest.mark.parametrize(("name", "half_width"), [("start[0].x", 0.1), ("modes[0].start", 2.0)])
 def test_the_range_of_a_number_is_the_same_for_one_of_several_data(name, half_width):
     for full in (name, f"data[0].{name}"):
-        region = region_of(LogDensity.of(line, Measurements([1.0], 0.1), {full: 2.0}), 3.0, 0.0)
+        region = region_of(LogDensity.of(line, Measurements([1.0], 0.1), {full: 2.0}), 3.0)
         assert_close(region.half_width, [half_width], rtol=1e-12)
 
 
