@@ -315,6 +315,10 @@ class Ensemble(eqx.Module):
             return cls(problem_of(model, cells, ()), None, None, None, 0, continues)
         return cls(None, *modes_of(model, cells, tolerance, (), continues), len(model.counters), continues)
 
+    def nudged(self, share: float) -> "Ensemble":
+        """The runs with resets from initial states whose components are larger by a share; smooth runs stay as they are."""
+        return self if self.states is None else dataclasses.replace(self, states=self.states * (1.0 + share))
+
     def solve(self, t1: Any, cells: Any, settings: Settings, traced: bool = False) -> Outcome | HybridOutcome:
         """The outcome of the runs.
 

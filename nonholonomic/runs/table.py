@@ -61,6 +61,7 @@ class TableJob(NamedTuple):
     - `errors`: whether to run every cell again at other tolerances.
     - `samples`: the quantities at given times, or `None`; `timed`: whether runs are timed, not only sampled.
     - `by_diffrax`: whether Diffrax solves smooth runs, one by one, as a slow reference.
+    - `nudge`: relative change of the initial states of runs with resets, which shows how resets amplify round-off.
     """
 
     model: AbstractModel
@@ -73,6 +74,7 @@ class TableJob(NamedTuple):
     samples: Samples | None = None
     timed: bool = True
     by_diffrax: bool = False
+    nudge: float = 0.0
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -165,8 +167,10 @@ class TableJob(NamedTuple):
         variables = self._results(cells, columns, size, count, self.slopes)
         if self.errors:
             tolerances = map(as_number, other_tolerances(float(self.settings.tolerance)))
-            jobs = [self._replace(settings=self.settings.with_tolerance(tolerance)) for tolerance in tolerances]
-            runs = [variables, *(job._results(cells, columns, size, count, None) for job in jobs)]
+            runs = [variables]
+            for number, tolerance in enumerate(tolerances, 1):
+                job = self._replace(settings=self.settings.with_tolerance(tolerance), nudge=number * NUDGE)
+                runs.append(job._results(cells, columns, size, count, None))
             # Where events are located: the error of a component is relative to the largest of its unit.
             ends = self.model.ends
             least: dict[str, float | Float[np.ndarray, " cells"]] = dict.fromkeys(self.bounded, 0.0)
@@ -194,7 +198,7 @@ class TableJob(NamedTuple):
                 for name, slope, scale in zip(names, along, scales, strict=True)
             }
         else:
-            ensemble = Ensemble.of(cells, size, settings.tolerance, self.continues)
+            ensemble = Ensemble.of(cells, size, settings.tolerance, self.continues).nudged(self.nudge)
             if self.by_diffrax:
                 assert ensemble.problem is not None
                 outcome = solve_by_diffrax(ensemble.problem, jnp.asarray(self.t1), settings)
@@ -218,14 +222,15 @@ class TableJob(NamedTuple):
         if self.crossing == "both":
             if isinstance(outcome, HybridOutcome):
                 # With several modes, the first event needs a separate solve, which ends there.
-                variables["first_time"] = first_events(cells, self.t1, size, count, settings)[1]
+                variables["first_time"] = first_events(cells, self.t1, size, count, settings, self.nudge)[1]
             else:
                 is_unresolved = np.asarray(status) == Status.UNRESOLVED
                 variables["first_time"] = np.where(is_unresolved, np.inf, np.asarray(outcome.first_crossing))
         for name, (_, other) in cells.further_times.items():
-            is_same = jax.tree.structure(other) == jax.tree.structure(cells) and self.crossing != "last"
-            first = self.times[0] if is_same else None
-            variables[name] = variables[first] if first else first_events(other, self.t1, size, count, settings)[1]
+            if jax.tree.structure(other) == jax.tree.structure(cells) and self.crossing != "last":
+                variables[name] = variables[self.times[0]]
+            else:
+                variables[name] = first_events(other, self.t1, size, count, settings, self.nudge)[1]
         variables |= {name: np.where(has_event, slope, 0.0) for name, slope in derivatives.items()}
         if slopes and not self.model.smooth:
             variables["grazes"] = (has_event & np.asarray(grazing)).astype(np.int8)
@@ -233,11 +238,11 @@ class TableJob(NamedTuple):
 
 
 def first_events(
-    cells: AbstractModel, t1: Number, size: int, count: int, settings: Settings
+    cells: AbstractModel, t1: Number, size: int, count: int, settings: Settings, nudge: float = 0.0
 ) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, " cells"], dict[str, Array]]:
     """The `Status` of runs that end on their event, the times of the events, infinite in cells that end otherwise, and the
-    variables that describe the ends."""
-    ensemble = Ensemble.of(cells, size, settings.tolerance, False)
+    variables that describe the ends. **Arguments:** `nudge`: as in `TableJob`."""
+    ensemble = Ensemble.of(cells, size, settings.tolerance, False).nudged(nudge)
     outcome = ensemble.solve(t1, count, settings)
     status, ends = at_the_end(cells, ensemble, outcome, settings.tolerance)
     status = np.asarray(status)
@@ -311,6 +316,10 @@ SAFETY = 5.0
 #: `CONVERGING` times what the first differs from them. Differences of chaotic runs are those of random histories, and up to
 #: 90 times smaller than the error.
 SAFETY_OF_HISTORIES, CONVERGING = 100.0, 1.0 / 3.0
+
+#: Relative change of the initial states of the other runs, times their number. Impacts can amplify round-off, of which there is
+#: as much in each run, by a factor of 10^7; where the tolerance does not limit the steps, the runs would share it.
+NUDGE = 4.0 * float(np.finfo(float).eps)
 
 #: Relative errors: of values that accumulate round-off over thousands of steps; of the ends of runs with events, which are
 #: located with it whatever the tolerance; and of differences between runs that are not from the tolerance.
