@@ -26,7 +26,7 @@ from nonholonomic.derivatives import VariationalProblem, tangents_of
 from nonholonomic.geometry import AbstractSurface
 from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, solve_ensemble
 from nonholonomic.parameters import with_numbers
-from stroller.model.scene import RideProblem
+from stroller.runs.model import RideModel
 from tippe.modes.problems import InversionProblem
 from tippe.runs.model import TopModel, modes_of
 
@@ -126,7 +126,7 @@ def of_stroller(ground: AbstractSurface) -> tuple[AbstractProblem, ...]:
     body = stroller.Stroller(12.0, 0.7, 1.5, 0.05, steering_spring=0.2)
     scene = stroller.Scene(body, ground, stroller.Damping(0.8, 0.4, 0.1, 0.02))
     launch = stroller.Launch((0.3, 0.5), 0.3, 1.5, 0.2, 0.5)
-    return (eqx.filter_eval_shape(lambda *roots: RideProblem.of(*roots, None, LAUNCHES, watched=True), scene, launch),)
+    return (eqx.filter_eval_shape(lambda *roots: RideModel.of(*roots, None).problem(LAUNCHES, ()), scene, launch),)
 
 
 def counts_of_field(problems: Problems) -> list[int]:

@@ -12,7 +12,7 @@ from peers import NUMPY, Task
 import stroller
 import tippe
 from nonholonomic.integration import AbstractProblem
-from stroller.model.scene import RideProblem
+from stroller.runs.model import RideModel
 from tippe.modes.problems import InversionProblem
 
 ANGLE = 0.95 * math.pi
@@ -80,7 +80,7 @@ def of_stroller(launches: int, t1: float) -> Case:
     launch = stroller.Launch((0.0, latitude), 0.3, np.linspace(1.0, 3.0, launches), 0.2, 0.5)
     scene.check(launch)
     # Contact is watched, as `stroller.sweep` does; none of these launches loses it.
-    problem = RideProblem.of(scene, launch, None, launches, watched=True)
+    problem = RideModel.of(scene, launch, None).problem(launches, ())
     numbers = (body.mass, body.wheelbase, body.inertia, body.steering_inertia, body.steering_spring, scene.gravity)
     numbers += (bowl.equatorial, bowl.polar, damping.rolling, damping.front, damping.scrub, damping.steering)
     return case(fields.spheroid, fields.Ride(*map(float, numbers)), problem, t1, None, POSITION)

@@ -14,7 +14,7 @@ from tops import rutstam_top
 
 import stroller
 import tippe
-from stroller.model.scene import RideProblem
+from stroller.runs.model import RideModel
 from tippe.modes.impact import FreeBody, Impact, Skid, approach, balls
 from tippe.modes.problems import InversionProblem, trajectory_problem
 from tippe.runs.model import TopModel, modes_of
@@ -200,7 +200,7 @@ def test_fields_of_the_stroller(ground, friction, spring, heading):
     for controls in (None, push):
         state = scene.state(launch, controls is not None)
         assert slow_in(lambda t, state, controls=controls: dynamics.field(t, state, controls), 0.0, state) == allowed
-    problem = RideProblem.of(scene, launch, None, 1, watched=True)
+    problem = RideModel.of(scene, launch, None).problem(1, ())
     states = problem.start()[0]
     assert slow_in(problem.field, jnp.zeros(1), states) == allowed
     rates = problem.field(jnp.zeros(1), states)

@@ -107,11 +107,10 @@ class Geometry(NamedTuple):
     """Position and motion of a state, before any force is computed.
 
     The rear axle moves along `direction` d; `lead` is the factor nu of the heading, `gauge` 1 / sqrt(M_w), and `sine` and
-    `cosine` are those of the steering angle.
+    `cosine` are those of the steering angle. `loads` [N]: those of the rear and the front axle.
     """
 
     motion: Motion
-    fork_rate: Float[Array, "..."]
     normal: Vector
     normal_rate: Vector
     direction: Vector
@@ -122,8 +121,7 @@ class Geometry(NamedTuple):
     sine: Float[Array, "..."]
     cosine: Float[Array, "..."]
     normal_force: Component
-    front_load: Component
-    rear_load: Component
+    loads: tuple[Component, Component]
 
 
 class Power(NamedTuple):
@@ -245,39 +243,29 @@ class Dynamics(eqx.Module):
 
     def geometry(self, state: State) -> Geometry:
         """Velocities, rates and normal force at a state (components, ...)."""
-        body, surface, side = self.body, self.surface, self.side
-        r, e, rest = self.unpack(state)
-        phi, P, fork_rate, sine, cosine = rest[:5]
-        n = surface.normal(r)
+        body, surface = self.body, self.surface
+        position, heading, others = self.unpack(state)
+        steering, momentum, fork_rate, sine, cosine = others[:5]
+        normal = surface.normal(position)
         # The heading, corrected for a drift off the ground or off unit length; an exact one, and its rate, stay unchanged.
-        unit = e if self.projected else sum_vectors(e, scale(subtract(None, dot(e, n)), n))
-        unit = scale(1.0 / jnp.sqrt(dot(unit, unit)), unit)
-        d, square, lead = self.direction(unit, n)
+        if not self.projected:
+            heading = sum_vectors(heading, scale(subtract(None, dot(heading, normal)), normal))
+        heading = scale(1.0 / jnp.sqrt(dot(heading, heading)), heading)
+        direction, square, lead = self.direction(heading, normal)
         gauge = 1.0 / jnp.sqrt(self.inertia(square, lead, sine, cosine))
-        wheel = P * gauge
-        velocity = scale(wheel * cosine, d)
-        normal_rate = surface.normal_rate(r, velocity)
-        normal_force = self.normal_force(n, normal_rate, velocity)
+        wheel = momentum * gauge
+        velocity = scale(wheel * cosine, direction)
+        normal_rate = surface.normal_rate(position, velocity)
+        normal_force = self.normal_force(normal, normal_rate, velocity)
         front_speed = multiply(wheel, lead)
         yaw_rate = front_speed * sine / body.wheelbase
         steering_rate = subtract(fork_rate, multiply(self.absolute, yaw_rate))
         front_load = multiply(normal_force, None if body.centre is None else body.centre / body.wheelbase)
-        motion = Motion(r, unit, phi, front_speed * cosine, front_speed, yaw_rate, steering_rate)
+        loads = (subtract(normal_force, front_load), front_load)
+        motion = Motion(position, heading, steering, front_speed * cosine, front_speed, yaw_rate, steering_rate)
+        left = scale(self.side, cross(normal, direction))
         return Geometry(
-            motion=motion,
-            fork_rate=fork_rate,
-            normal=n,
-            normal_rate=normal_rate,
-            direction=d,
-            velocity=velocity,
-            left=scale(side, cross(n, d)),
-            lead=lead,
-            gauge=gauge,
-            sine=sine,
-            cosine=cosine,
-            normal_force=normal_force,
-            front_load=front_load,
-            rear_load=subtract(normal_force, front_load),
+            motion, normal, normal_rate, direction, velocity, left, lead, gauge, sine, cosine, normal_force, loads
         )
 
     def normal_force(self, normal: Vector, normal_rate: Vector, velocity: Vector) -> Component:
@@ -290,16 +278,10 @@ class Dynamics(eqx.Module):
         motion = geometry.motion
         drive, torque = (None, None) if controls is None else controls(t, motion)
         speeds = (motion.speed, motion.front_speed, motion.yaw_rate, motion.steering_rate)
-        drag = self.friction.drag(WheelMotion(*speeds, geometry.rear_load, geometry.front_load))
+        drag = self.friction.drag(WheelMotion(*speeds, *geometry.loads))
         spring = multiply(self.body.steering_spring, motion.steering)
-        power = Power(
-            drive=multiply(drive, motion.speed),
-            steering=multiply(torque, motion.steering_rate),
-            rear=multiply(drag.rear, motion.speed),
-            front=multiply(drag.front, motion.front_speed),
-            yaw=multiply(drag.yaw, motion.yaw_rate),
-            fork=multiply(drag.steering, motion.steering_rate),
-        )
+        # Of each force and torque, with the speed along it.
+        power = Power(*map(multiply, (drive, torque, *drag), (motion.speed, motion.steering_rate, *speeds)))
         return Forces(drive, torque, drag, subtract(add(torque, drag.steering), spring), power)
 
     def field(self, t: Float[Array, "..."], state: State, controls: Input | None = None) -> State:
@@ -397,7 +379,8 @@ class Dynamics(eqx.Module):
         )
         if not is_horizontal:
             # Curvature turns the frame as it moves, and the spin of the frame reacts with a sideways force.
-            carried = add(body.inertia * yaw, multiply(self.absolute, body.steering_inertia, g.fork_rate))
+            fork_rate = self.unpack(state)[2][2]
+            carried = add(body.inertia * yaw, multiply(self.absolute, body.steering_inertia, fork_rate))
             gyration = multiply(self.surface.gaussian_curvature(g.motion.position), carried, v)
             missing_force = sum_vectors(missing_force, scale(subtract(None, gyration), left))
         moment = add(drag.yaw, multiply(drag.front, body.wheelbase, g.sine))

@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from nonholonomic.compilation.components import Held, TooLarge, by_components, over_last_axis, spelled_out
 from nonholonomic.compilation.tracing import TracedFunction, in_cells, is_elementary, jumps_of, warn_of_unclear
 from nonholonomic.geometry import Vector
-from nonholonomic.text import described, is_users, likely, name_of, shown
+from nonholonomic.text import Numbers, described, is_users, joined, likely, name_of, shown
 from nonholonomic.validation import Bounded, as_number, is_traced
 
 
@@ -104,6 +104,11 @@ def at_start(scene: Any, launch: Any) -> tuple[Float[Array, ""], Motion]:
     return jnp.zeros(()), scene.dynamics.geometry(state).motion
 
 
+def example_arguments(scene: Any, launch: Any) -> tuple[Float[Array, ""], Motion]:
+    """Arguments of an input in a single ride, whose values do not matter, also for a launch of many cells."""
+    return jax.tree.map(lambda part: jnp.zeros((), part.dtype), eqx.filter_eval_shape(at_start, scene, launch))
+
+
 def check_input(controls: Any, scene: Any, launch: Any, jumps: Any = None) -> None:
     """Raise `ValueError` unless an input can be called, traced by JAX, and is finite at the start of a run; warn of
     comparisons of the time whose jumps are unknown.
@@ -182,6 +187,11 @@ def jump_times(
     return jnp.stack(rows) if rows else None
 
 
+def has_arrays(tree: PyTree) -> bool:
+    """Whether some leaf is an array with axes."""
+    return any(eqx.is_array(leaf) and leaf.ndim > 0 for leaf in jax.tree.leaves(tree))
+
+
 class Formula(eqx.Module):
     """An input module made from a function. The arrays in the function are leaves, and its operations are compared one by
     one.
@@ -228,20 +238,15 @@ class PerRide(eqx.Module):
 
     @classmethod
     def of(cls, controls: Any, t: Any, motion: Any) -> "PerRide":
-        """The input of a single ride, with arguments of these types."""
-        sizes = [leaf.size for leaf in jax.tree.leaves(controls) if eqx.is_inexact_array(leaf)]
-        if sum(sizes) > MOST_ELEMENTS:
-            return cls(controls, False)
+        """The input of a single ride, with arguments such as these."""
         arrays, static = eqx.partition(controls, eqx.is_inexact_array)
-
-        def of_ride(arrays: Any, moving: Any) -> Any:
-            return spelled_out(lambda *parts: eqx.combine(parts[0], static)(*parts[1]))(arrays, moving)
-
-        moving = jax.tree.map(lambda shape: jnp.zeros(shape.shape), (t, motion))
-        many = jax.tree.map(lambda leaf: leaf[..., None], (arrays, moving))
+        if sum(leaf.size for leaf in jax.tree.leaves(arrays)) > MOST_ELEMENTS:
+            return cls(controls, False)
+        of_ride = spelled_out(lambda arrays, moving: eqx.combine(arrays, static)(*moving))
+        many = jax.tree.map(lambda leaf: leaf[..., None], (arrays, (t, motion)))
         with contextlib.suppress(TooLarge):
             jax.eval_shape(lambda parts: cls(eqx.combine(parts[0], static), True)(*parts[1]), many)
-            return cls(controls, is_elementary(of_ride, arrays, moving))
+            return cls(controls, is_elementary(of_ride, arrays, (t, motion)))
         return cls(controls, False)
 
     def of_cells(self, cells: int) -> "PerRide":
@@ -254,37 +259,31 @@ class PerRide(eqx.Module):
         return PerRide(jax.tree.map(spread, self.input), self.by_elements)
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        moving, structure = jax.tree.flatten((t, motion))
-        moving = jnp.broadcast_arrays(*moving)
-        if moving[0].ndim == 0:
+        leaves, structure = jax.tree.flatten((t, motion))
+        leaves = jnp.broadcast_arrays(*leaves)
+        if leaves[0].ndim == 0:
             return self.input(t, motion)
+        moving = jax.tree.unflatten(structure, leaves)
         arrays, static = eqx.partition(self.input, eqx.is_inexact_array)
-        numbers, of_numbers = jax.tree.flatten(arrays)
 
-        def of_ride(numbers: list[Array], moving: list[Array]) -> Any:
-            controls = eqx.combine(jax.tree.unflatten(of_numbers, numbers), static)
-            return tuple(controls(*jax.tree.unflatten(structure, moving)))
+        def of_ride(arrays: PyTree[Array], moving: Any) -> Any:
+            return tuple(eqx.combine(joined(arrays), static)(*moving))
 
-        if not self.by_elements:
-            own = jax.tree.map(lambda part: jax.ShapeDtypeStruct(part.shape[:-1], part.dtype), (numbers, moving))
-            with contextlib.suppress(TooLarge):
-                return over_last_axis(of_ride, *own)(numbers, moving)
-            axes = [-1 if number.ndim else None for number in numbers]
-            return jax.vmap(of_ride, in_axes=(axes, 0))(numbers, moving)
+        def split(array: Array) -> Array | Numbers:
+            """An array as vectors of rides, one for each of its numbers."""
+            if array.ndim == 0:
+                return array
+            flat = array.reshape(-1, array.shape[-1])
+            # The derivative of this operation joins all numbers at once.
+            return Numbers(tuple(row[0] for row in jax.lax.split(flat, (1,) * len(flat))), array.shape[:-1])
 
-        def of_elements(elements: list[list[Array]], moving: list[Array]) -> Any:
-            shapes = [number.shape[:-1] for number in numbers]
-            return of_ride(
-                [jnp.stack(part).reshape(shape) for part, shape in zip(elements, shapes, strict=True)], moving
-            )
-
-        # Every number of an array is a vector of rides.
-        elements = []
-        for number in numbers:
-            flat = number.reshape(-1, *number.shape[-1:])
-            # This operation's derivative joins all elements at once.
-            split = [number] if number.ndim == 0 else [row[0] for row in jax.lax.split(flat, (1,) * len(flat))]
-            elements.append(split)
-        scalars = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), (elements, moving))
-        results = by_components(of_elements, *scalars)(elements, moving)
-        return jax.tree.map(lambda part: jnp.broadcast_to(part, moving[0].shape), results)
+        if self.by_elements:
+            parts = (jax.tree.map(split, arrays), moving)
+            scalars = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), parts)
+            results = by_components(of_ride, *scalars)(*parts)
+            return jax.tree.map(lambda part: jnp.broadcast_to(part, leaves[0].shape), results)
+        own = jax.tree.map(lambda part: jax.ShapeDtypeStruct(part.shape[:-1], part.dtype), (arrays, moving))
+        with contextlib.suppress(TooLarge):
+            return over_last_axis(of_ride, *own)(arrays, moving)
+        axes = jax.tree.map(lambda array: -1 if array.ndim else None, arrays)
+        return jax.vmap(of_ride, in_axes=(axes, 0))(arrays, moving)

@@ -5,22 +5,20 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
-from nonholonomic.compilation.components import Held
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, Sphere, Torus, stacked
 from nonholonomic.geometry.surface import as_surface
 from nonholonomic.integration import AbstractProblem, Jumps
 from nonholonomic.parameters import as_one
-from nonholonomic.text import is_array, is_users, parted, shown
+from nonholonomic.text import is_array, shown
 from nonholonomic.validation import Bound, Bounded, Converted, Usual, as_number, is_traced, require_all, require_kind
 
 from ..friction import AbstractFriction, Frictionless, as_law
 from .dynamics import Dynamics, State, Stroller
-from .input import MOST_ELEMENTS, Formula, Input, PerRide, at_start, jump_times
+from .input import Input, PerRide
 
 # Launches: how a ride starts.
 
@@ -284,7 +282,7 @@ CONTACT_ROUND_OFF = 1e-12
 
 class RideProblem(AbstractProblem):
     """One ride, or the rides of many cells. If `watched`, the event is that the ground would have to pull; if
-    `guarded`, a ride ends when the constraints lose rank.
+    `guarded`, a ride ends when the constraints lose rank. `press`: a force [N] that measures the normal force.
     """
 
     dynamics: Dynamics
@@ -299,43 +297,6 @@ class RideProblem(AbstractProblem):
     @property
     def fits_one_kernel(self) -> bool:
         return not isinstance(self.input, PerRide) or self.input.by_elements
-
-    @classmethod
-    def of(
-        cls,
-        scene: Scene,
-        launch: Launch,
-        controls: Input | None,
-        cells: int | None = None,
-        watched: bool = False,
-        jumps: tuple[Array, ...] = (),
-    ) -> "RideProblem":
-        """The problem of one ride, which continues if contact or rank is lost, or of a number of cells, in which every number
-        is a scalar or one per cell. **Arguments:** `jumps`: times at which the input jumps, apart from those that its
-        comparisons of the time show."""
-        driven, times = controls is not None, None
-        if controls is not None:
-            # The types of the arguments in a single ride.
-            arguments = eqx.filter_eval_shape(at_start, scene, launch)
-            t, motion = jax.tree.map(lambda part: jnp.zeros((), part.dtype), arguments)
-            if cells is not None and isinstance(controls, Formula) and has_arrays(controls):
-                controls = PerRide.of(controls, t, motion).of_cells(cells)
-            times = jump_times(controls, jumps, t, motion, cells)
-        states, scales = scene.state(launch, driven), scene.scales(launch, driven)
-        if cells is not None:
-            states, scales = (
-                jnp.broadcast_to(part.reshape(len(part), -1), (len(part), cells)) for part in (states, scales)
-            )
-        return cls(
-            scene.dynamics,
-            controls,
-            states,
-            scales,
-            press=scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3),
-            watched=watched and not isinstance(scene.surface, Plane),
-            guarded=cells is not None and scene.heading == "projected",
-            jump_times=times,
-        )
 
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         return self.states, self.scales
@@ -354,22 +315,3 @@ class RideProblem(AbstractProblem):
 
     def jumps(self, time: Float[Array, "..."], state: State) -> Jumps | None:
         return None if self.jump_times is None else Jumps.at(self.jump_times)
-
-
-def as_module(controls: Any, scene: Scene, launch: Launch) -> Any:
-    """An input as a module whose numbers are leaves, evaluated for single rides. A function, or a module with many numbers, is
-    traced once, with scalar arguments."""
-    if controls is None or isinstance(controls, Held | Formula):
-        return controls
-    if isinstance(controls, eqx.Module):
-        if not (is_users(type(controls)) or has_arrays(controls)):
-            return controls
-        if sum(np.size(leaf) for leaf in jax.tree.leaves(controls) if is_array(leaf)) <= MOST_ELEMENTS:
-            return Held(parted(controls))
-
-    return Formula.of(controls, *eqx.filter_eval_shape(at_start, scene, launch))
-
-
-def has_arrays(tree: PyTree) -> bool:
-    """Whether some leaf is an array with axes."""
-    return any(eqx.is_array(leaf) and leaf.ndim > 0 for leaf in jax.tree.leaves(tree))

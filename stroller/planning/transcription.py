@@ -78,7 +78,7 @@ def actuation(dynamics: Dynamics, pose: Pose, rates: Rates, with_grip: bool) -> 
         # `side_force` expects the work components.
         whole = jnp.concatenate([state, jnp.zeros(2 + dynamics.friction.dissipates)])
         sides = dynamics.side_force(jnp.zeros(()), whole, lambda t, motion: (force, torque))
-        loads = [load for load in (geometry.rear_load, geometry.front_load) if load is not None]
+        loads = [load for load in geometry.loads if load is not None]
         grip = jnp.stack([jnp.abs(side) / load for side, load in zip(sides, loads, strict=False)])
     normal_force = jnp.broadcast_to(multiply(1.0, geometry.normal_force), jnp.shape(rates.steering))
     return Actuation(force, torque, geometry.motion.speed, normal_force, grip)

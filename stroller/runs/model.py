@@ -29,13 +29,14 @@ from nonholonomic.runs.sweep import Options, table_of
 from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Table, Variable
 from nonholonomic.terminal import status_line
-from nonholonomic.text import name_of, shown
+from nonholonomic.text import is_array, is_users, name_of, parted, shown
 from nonholonomic.validation import all_bounds, explaining, legal, require_kind, require_outside, require_scalars
 
 from ..friction import Damping, RollingResistance
+from ..model import input as inputs
 from ..model.dynamics import Stroller
-from ..model.input import Formula, Input, PerRide, Steady, as_jumps, at_start, check_input
-from ..model.scene import USUAL, Launch, RideProblem, Scene, as_module, has_arrays
+from ..model.input import Formula, Input, PerRide, Steady
+from ..model.scene import USUAL, Launch, RideProblem, Scene
 from .trajectory import QUANTITIES, TIMED, VECTORS, RideState, Trajectory, ride
 
 #: Names of the coordinates of a place in the fixed frame.
@@ -102,10 +103,20 @@ class RideModel(AbstractSceneModel):
 
     @classmethod
     def of(cls, scene: Scene, launch: Launch, controls: Any, event: Any = None, jumps: object = None) -> AbstractModel:
-        """The model of a ride, with a user's event if there is one."""
-        module = as_module(controls, scene, launch)
-        original = None if isinstance(module, Held) or module is controls else Original(controls)
-        ride = cls(scene=scene, launch=launch, input=module, original=original, jumps=as_jumps(jumps))
+        """The model of a ride, with a user's event if there is one.
+
+        The input becomes a module whose numbers are leaves, evaluated for single rides. A function, or a module with many
+        numbers, is traced once.
+        """
+        module, original, is_module = controls, None, isinstance(controls, eqx.Module)
+        is_own = is_module and not (is_users(type(controls)) or inputs.has_arrays(controls))
+        if not (controls is None or is_own or isinstance(controls, Held | Formula)):
+            sizes = [np.size(leaf) for leaf in jax.tree.leaves(controls) if is_array(leaf)]
+            if is_module and sum(sizes) <= inputs.MOST_ELEMENTS:
+                module = Held(parted(controls))
+            else:
+                module, original = Formula.of(controls, *inputs.example_arguments(scene, launch)), Original(controls)
+        ride = cls(scene=scene, launch=launch, input=module, original=original, jumps=inputs.as_jumps(jumps))
         return with_event(ride, event)
 
     def __reduce__(self) -> Any:
@@ -166,19 +177,31 @@ class RideModel(AbstractSceneModel):
         return legal(bounds) & ~jnp.asarray(sideways | on_equator)
 
     def for_lanes(self) -> tuple["RideModel", bool]:
-        if not isinstance(self.input, Formula | Held) or has_arrays((self.scene, self.launch)):
+        if not isinstance(self.input, Formula | Held) or inputs.has_arrays((self.scene, self.launch)):
             return self, isinstance(self.input, PerRide)
-        t, motion = eqx.filter_eval_shape(at_start, self.scene, self.launch)
         controls = self.input.whole if isinstance(self.input, Held) else self.input
-        return dataclasses.replace(self, input=PerRide.of(controls, t, motion)), True
+        controls = PerRide.of(controls, *inputs.example_arguments(self.scene, self.launch))
+        return dataclasses.replace(self, input=controls), True
 
     @property
     def has_event(self) -> bool:
         return self.event is not None or not isinstance(self.scene.surface, Plane)
 
     def problem(self, cells: int | None, names: Names) -> AbstractProblem:
-        watched = cells is not None and self.event is None and names is not None and not names
-        ride = RideProblem.of(self.scene, self.launch, self.input, cells, watched, self.jumps)
+        scene, launch, controls, times = self.scene, self.launch, self.input, None
+        if controls is not None:
+            arguments = inputs.example_arguments(scene, launch)
+            if cells is not None and isinstance(controls, Formula) and inputs.has_arrays(controls):
+                controls = PerRide.of(controls, *arguments).of_cells(cells)
+            times = inputs.jump_times(controls, self.jumps, *arguments, cells)
+        parts = [scene.state(launch, controls is not None), scene.scales(launch, controls is not None)]
+        if cells is not None:
+            parts = [jnp.broadcast_to(part.reshape(len(part), -1), (len(part), cells)) for part in parts]
+        press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
+        # A run without an event, or of which quantities are read, goes on where the ground would have to pull.
+        watched = cells is not None and names == () and self.event is None and not isinstance(scene.surface, Plane)
+        guarded = cells is not None and scene.heading == "projected"
+        ride = RideProblem(scene.dynamics, controls, parts[0], parts[1], press, watched, guarded, times)
         # The state ends with the time if a quantity depends on the input.
         return ride if self.input is None or names is None or TIMED.isdisjoint(names) else with_clock(ride)
 
@@ -190,7 +213,7 @@ class RideModel(AbstractSceneModel):
         """Whether the input depends on some of its arguments, the time `t` and the parts of the motion."""
         if self.input is None:
             return False
-        t, motion = jax.tree.map(lambda part: jnp.zeros(()), eqx.filter_eval_shape(at_start, self.scene, self.launch))
+        t, motion = inputs.example_arguments(self.scene, self.launch)
         values = {"t": t, **motion._asdict()}
 
         def returned(moved: dict[str, PyTree]) -> PyTree:
@@ -282,7 +305,7 @@ def _(system: Scene, start: Any, event: Any = None, input: Input | None = None, 
     require_kind(start, "start", Launch)
     require_scalars(numbers("scene", system, functions=False) | numbers("launch", start), LISTS)
     system.check(start)
-    check_input(input, system, start, jumps)
+    inputs.check_input(input, system, start, jumps)
     return RideModel.of(system, start, input, event, jumps)
 
 

@@ -22,7 +22,7 @@ from nonholonomic.runs.model import AbstractModel
 from nonholonomic.runs.simulate import evenly_spaced, sampled_if_legal
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
-from nonholonomic.text import Unit, distinguishing_labels
+from nonholonomic.text import Unit, as_text, distinguishing_labels
 
 from ..model.dynamics import Power, State, padded
 from ..model.input import Input
@@ -43,7 +43,7 @@ class RideState:
         # Vectors in the fixed frame, and the numbers of the place.
         self.position, self.direction = (surface.in_fixed_frame(vector) for vector in self.motion[:2])
         self.place = surface.place_at(self.motion.position)
-        self.load = self.vector((self.geometry.rear_load, self.geometry.front_load))
+        self.load = self.vector(self.geometry.loads)
 
     @functools.cached_property
     def power(self) -> Power:
@@ -154,15 +154,6 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: S
     of_runs = {name: [np.asarray(run[name]) for run in runs] for name in quantities}
     values = {name: np.stack(of_each) if names else of_each[0] for name, of_each in of_runs.items()}
     return run_table(quantities, coords, values, [*(["ride"] if names else []), "time"], request)
-
-
-def names_of(runs: list[Any], unit: Unit = None) -> list[str]:
-    """Names of rides, by what differs in their durations, scenes and launches. **Arguments:** `unit`: as for `plot`."""
-    for run in runs:
-        validation.require_one_run(run, "a picture", ", and pass the others as others=")
-    starts = [(f"ride of {float(run.t[-1]):.3g} s",) for run in runs]
-    scenes, launches = ([getattr(run.model, name) for run in runs] for name in ("scene", "launch"))
-    return distinguishing_labels(starts, scenes, launches, unit=unit)
 
 
 # The steps of a ride, the states between them, found by repeating a step with another length, and zero crossings.
@@ -470,7 +461,12 @@ class Trajectory(AbstractRun):
         return table_of([self], [], self.model.description() | {"status": self.status}, names)
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
-        return names_of(runs, unit)
+        """Names of rides, by what differs in their durations, scenes and launches."""
+        for run in runs:
+            validation.require_one_run(run, "a picture", ", and pass the others as others=")
+        starts = [(f"ride of {float(run.t[-1]):.3g} s",) for run in runs]
+        scenes, launches = ([getattr(run.model, name) for run in runs] for name in ("scene", "launch"))
+        return distinguishing_labels(starts, scenes, launches, unit=unit)
 
     def in_words(self) -> str:
         jackknives = self.jackknifed_at
@@ -478,12 +474,12 @@ class Trajectory(AbstractRun):
             f"Trajectory of {self.t.size} times, {float(self.t[0]):g} s to {float(self.t[-1]):g} s: {self.status}",
             f"  launch          {self.model.launch}",
             f"  steps           {int(self.stats.steps)} accepted, {int(self.stats.rejected)} rejected",
-            f"  end             place {shown(self.place[-1])}, heading {float(self.heading[-1]):.6g} rad, "
+            f"  end             place {as_text(tuple(self.place[-1]))}, heading {float(self.heading[-1]):.6g} rad, "
             f"speed {float(self.speed[-1]):.6g} m/s, steering {float(self.steering[-1]):.6g} rad",
             f"  energy          {float(self.energy[0]):.6g} J to {float(self.energy[-1]):.6g} J, "
             f"work {float(self.work[-1]):.6g} J, residual {float(jnp.max(jnp.abs(self.energy_residual))):.1e} J",
             f"  normal force    {float(jnp.min(self.normal_force)):.6g} N to {float(jnp.max(self.normal_force)):.6g} N",
-            f"  side forces     up to {shown(jnp.max(jnp.abs(self.side_force), axis=0))} N, rear and front",
+            f"  side forces     up to {as_text(tuple(jnp.max(jnp.abs(self.side_force), axis=0)))} N, rear and front",
             f"  grip            {self.grip_in_words}",
             f"  no-slip         {float(jnp.max(jnp.abs(self.constraint))):.1e} m/s",
         ]
@@ -497,11 +493,6 @@ class Trajectory(AbstractRun):
         if jackknives.size:
             lines.append(f"  jackknifed      at {', '.join(f'{time:.6g}' for time in jackknives)} s")
         return "\n".join(lines)
-
-
-def shown(numbers: Float[Array, " n"]) -> str:
-    """Numbers in brackets, to six digits."""
-    return f"({', '.join(f'{float(number):.6g}' for number in numbers)})"
 
 
 def read_off(
@@ -540,10 +531,7 @@ def ride(
     times = evenly_spaced(end) if times is None else validation.as_known(times)
     require_times(times, t1)
     if isinstance(solver, ImplicitMidpoint):
-        jumps = model.problem(None, ()).jump_times
-        known = jumps is not None and not validation.is_traced((jumps, times, end))
-        inside = [time for time in np.asarray(jumps) if 0.0 < time < end] if known else []
-        grid = even_steps(jnp.asarray(np.union1d(times, inside)) if inside else times, end, solver.step_length)
+        grid = even_steps(times, end, solver.step_length, model.problem(None, ()).jump_times)
         max_steps = grid.size
     settings = Settings(tolerance, solver, max_steps=max_steps)
     # Inside a transformation, this traces all numbers, even if they are known.
@@ -574,16 +562,19 @@ def _sampled(spec: RideSpec, times: Float[Array, " times"], adjoint: diffrax.Abs
 
 
 def even_steps(
-    times: Float[Array, " times"], t1: Float[Array, ""], max_duration: Float[Array, ""]
+    times: Float[Array, " times"], t1: Float[Array, ""], max_duration: Float[Array, ""], jumps: Array | None
 ) -> Float[Array, " steps"]:
-    """Times from 0 to `t1`, at most `max_duration` apart, that include all `times` and are evenly spaced between them.
+    """Times from 0 to `t1`, at most `max_duration` apart, that include all `times` and all known `jumps` of the input, and are
+    evenly spaced between them.
 
-    **Raises:** `ValueError` if an argument is traced, because the number of steps is part of the program.
+    **Raises:** `ValueError` if another argument is traced, because the number of steps is part of the program.
     """
     for name, number in {"t1": t1, "times": times, "step_length": max_duration}.items():
         if validation.is_traced(number):
             raise ValueError(f"{name} is traced and must be known for ImplicitMidpoint, whose steps are fixed")
-    knots = np.union1d(np.asarray(times), [0.0, float(t1)])
+    known_jumps = np.zeros(0) if jumps is None or validation.is_traced(jumps) else np.asarray(jumps)
+    inside = known_jumps[(known_jumps > 0.0) & (known_jumps < t1)]
+    knots = np.union1d(np.append(np.asarray(times), inside), [0.0, float(t1)])
     counts = np.ceil(np.diff(knots) / float(max_duration) * (1.0 - 1e-12)).astype(int)
     pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]
     return jnp.asarray(np.concatenate([*pieces, knots[-1:]]))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic import views
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import AbstractPassive, ExtendedProblem
+from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import numbers
 from nonholonomic.runs.model import Sliders
@@ -26,7 +26,7 @@ from ..model.dynamics import State
 from ..model.input import Input
 from ..model.scene import DRIVES, Launch, RideProblem, Scene
 from .model import RideModel, checked_model
-from .trajectory import MOST_GRIP, QUANTITIES, RideState, Trajectory, names_of
+from .trajectory import MOST_GRIP, QUANTITIES, RideState, Trajectory
 
 #: JAX's arrays for a page, or NumPy's for a picture.
 Values = TypeVar("Values", Array, np.ndarray)
@@ -69,7 +69,7 @@ CURVES |= {"normal_force": "normal force [N]"}
 @views.stages_of.register(Trajectory)
 def _(run: Trajectory, runs: list[Trajectory], overlaid: bool, unit: Unit) -> list[views.Stage]:
     numbered = list(enumerate(runs))
-    return grouped([numbered] if overlaid else [[ride] for ride in numbered], names_of(runs, unit))
+    return grouped([numbered] if overlaid else [[ride] for ride in numbered], run.labels_of(runs, unit))
 
 
 def grouped(groups: list[list[tuple[int, Trajectory]]], names: list[str]) -> list[views.Stage]:
@@ -275,10 +275,9 @@ def explore(
 def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[LiveRun, views.Stage]:
     """The contents of the page, and the stage."""
 
-    def rolling(model: RideModel) -> ExtendedProblem[RideProblem]:
+    def rolling(model: RideModel) -> AbstractProblem:
         """A ride of one cell with the rolling angles of its wheels."""
-        ride = RideProblem.of(model.scene, model.launch, model.input, 1, False, model.jumps)
-        return ExtendedProblem(ride, WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
+        return ExtendedProblem(model.problem(1, None), WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
 
     knobs = sliders_of(model, default_ranges(model.scene, model.launch) if sliders is None else sliders)
     live = live_run(

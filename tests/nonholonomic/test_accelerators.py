@@ -12,7 +12,7 @@ from jax import export
 import stroller
 import tippe
 from nonholonomic.integration import Oscillatory8, Settings, solve_ensemble
-from stroller.model.scene import RideProblem
+from stroller.runs.model import RideModel
 from tippe.modes.problems import InversionProblem
 from tippe.runs.model import modes_of
 
@@ -47,7 +47,7 @@ def table_of_rides(speeds):
     body = stroller.Stroller(12.0, 0.7, 1.5, 0.05)
     ride = stroller.Scene(body, stroller.Spheroid(6.0, 3.0), stroller.Damping(0.8, 0.4, 0.1, 0.02), side="inside")
     launch = stroller.Launch((0.0, -1.0), 0.3, speeds, 0.2, 0.5)
-    return ended(RideProblem.of(ride, launch, None, len(speeds), watched=True), len(speeds), nonterminal=True)
+    return ended(RideModel.of(ride, launch, None).problem(len(speeds), ()), len(speeds), nonterminal=True)
 
 
 def hybrid_table(law, thetas):

@@ -25,7 +25,6 @@ from stroller import (
     Torus,
 )
 from stroller.__main__ import GROUNDS, main, parser, scenes
-from stroller.model.scene import RideProblem
 from stroller.runs.model import RideModel
 
 BODY = Stroller(1.7, 0.3, 0.4, 0.05)
@@ -119,11 +118,11 @@ def test_lanes_with_their_own_places_and_hills_are_single_scenes():
     """The field of a table's cells, of which every number of launch, surface and body is its own."""
     heights, places = np.array([0.5, 0.9, -0.4]), np.array([[-2.0, 0.1, 1.0], [0.3, 0.2, -0.5]])
     batch = eqx.tree_at(lambda hill: hill.surface.height.height, HILL, jnp.asarray(heights))
-    problem = RideProblem.of(batch, Launch(tuple(places), 0.1, 2.5, 0.2), None, 3, True)
+    problem = RideModel.of(batch, Launch(tuple(places), 0.1, 2.5, 0.2), None).problem(3, ())
     field = eqx.filter_jit(lambda problem: problem.field(jnp.zeros(3), problem.states))(problem)
     for k, height in enumerate(heights):
         hill = eqx.tree_at(lambda scene: scene.surface.height.height, HILL, jnp.asarray(height))
-        single = RideProblem.of(hill, Launch(tuple(places[:, k]), 0.1, 2.5, 0.2), None)
+        single = RideModel.of(hill, Launch(tuple(places[:, k]), 0.1, 2.5, 0.2), None).problem(None, None)
         np.testing.assert_allclose(problem.states[:, k], single.states, atol=1e-14)
         np.testing.assert_allclose(field[:, k], single.field(jnp.zeros(()), single.states), atol=1e-13)
 

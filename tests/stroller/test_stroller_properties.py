@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from nonholonomic.integration import Settings, solve_ensemble
 from nonholonomic.integration.problem import LEFT_DOMAIN, REACHED_END
 from stroller import Damping, Launch, Plane, RollingResistance, Scene, Sphere, Spheroid, Stroller
-from stroller.model.scene import RideProblem
+from stroller.runs.model import RideModel
 
 HORIZON = 0.25
 
@@ -45,7 +45,7 @@ def ride(scene: Scene, launch: Launch, tolerance: float = 1e-9, states=None, sca
         return jax.tree.map(lambda leaf: np.tile(leaf, copies) if np.ndim(leaf) else leaf, tree)
 
     cells = copies * LANES
-    problem = RideProblem.of(repeated(scene), repeated(launch), None, cells, watched=False)
+    problem = RideModel.of(repeated(scene), repeated(launch), None).problem(cells, None)
     problem = eqx.tree_at(lambda problem: problem.states, problem, jnp.asarray(np.tile(start, cells // count)))
     if scales is not None:
         problem = eqx.tree_at(lambda problem: problem.scales, problem, jnp.asarray(np.tile(scales, copies)))

@@ -23,7 +23,7 @@ from stroller import (
     Spheroid,
     Stroller,
 )
-from stroller.model.scene import RideProblem
+from stroller.runs.model import RideModel
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 FULL = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side="inside", fork="absolute")
@@ -105,7 +105,7 @@ def test_a_batch_of_implicit_rides_compiles_without_a_complaint(capfd):
 
 def test_a_ride_by_the_midpoint_rule_can_be_kept_on_disk():
     """JAX does not cache a program that calls back into Python, as Diffrax's checks of given steps do."""
-    problem, grid = RideProblem.of(FULL, LAUNCH, None), jnp.linspace(0.0, 0.1, 3)
+    problem, grid = RideModel.of(FULL, LAUNCH, None).problem(None, None), jnp.linspace(0.0, 0.1, 3)
     settings = Settings(1e-9, ImplicitMidpoint(0.05))
     program = jax.make_jaxpr(lambda t1: sample(problem, None, t1, settings, grid=grid)[1])(0.1)
     program_of_times = jax.make_jaxpr(lambda t1: sample(problem, grid, t1, settings, grid=grid)[1])(0.1)
