@@ -162,13 +162,14 @@ def as_jumps(jumps: Any) -> tuple[Array, ...]:
 
 def is_searched(controls: Any) -> bool:
     """Whether an input is a user's, so that its comparisons of the time are searched for jumps; those of plans are smooth."""
-    if is_users(type(controls)):
-        return True
-    # A module that evaluates another one ride by ride.
-    if isinstance(controls, Held):
+    if isinstance(controls, Held | PerRide):
         return is_searched(controls.function)
-    inner = getattr(controls, "input", getattr(controls, "function", None))
-    return getattr(controls, "searched", False) if inner is None else is_searched(inner)
+    return is_users(type(users_input(controls)))
+
+
+def users_input(controls: Any) -> Any:
+    """An input before it was traced."""
+    return controls.program.function if isinstance(controls, Formula) else controls
 
 
 def jump_times(
@@ -193,28 +194,27 @@ def has_arrays(tree: PyTree) -> bool:
 
 
 class Formula(eqx.Module):
-    """An input module made from a function. The arrays in the function are leaves, and its operations are compared one by
-    one.
+    """An input module made from a function. The arrays in the function are leaves, `held`, and its operations are compared one
+    by one; `program` also has the function itself.
 
     If you define the same function again, as in a notebook's cell, it is not compiled again.
     """
 
     held: tuple[Array, ...]
     program: TracedFunction = eqx.field(static=True)
-    searched: bool = eqx.field(static=True, default=True)
 
     @classmethod
     def of(cls, controls: Any, t: Any, motion: Any) -> "Formula":
-        """The formula of a function that takes scalars of these types; their values do not matter."""
+        """The formula of a function, with arguments such as these."""
         closed = jax.make_jaxpr(lambda *arguments: tuple(map(as_number, controls(*arguments))))(t, motion)
         # The arrays become the first arguments.
         inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
         program = ClosedJaxpr(closed.jaxpr.replace(constvars=[], invars=inputs), ())
-        return cls(tuple(closed.consts), TracedFunction(jaxpr_as_fun(program), program), is_searched(controls))
+        return cls(tuple(closed.consts), TracedFunction(controls, program))
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         leaves = jnp.broadcast_arrays(*jax.tree.leaves((t, motion)))
-        run = functools.partial(self.program, *self.held)
+        run = functools.partial(jaxpr_as_fun(self.program.program), *self.held)
         for _ in range(leaves[0].ndim):
             run = jax.vmap(run)
         return tuple(run(*leaves))
@@ -233,7 +233,7 @@ class PerRide(eqx.Module):
     - `by_elements`: whether every number of an array is a vector of rides; larger inputs stay in arrays.
     """
 
-    input: Any
+    function: Any
     by_elements: bool = eqx.field(static=True)
 
     @classmethod
@@ -256,15 +256,15 @@ class PerRide(eqx.Module):
             is_array = eqx.is_inexact_array(leaf) and leaf.ndim
             return jnp.broadcast_to(leaf[..., None], (*leaf.shape, cells)) if is_array else leaf
 
-        return PerRide(jax.tree.map(spread, self.input), self.by_elements)
+        return PerRide(jax.tree.map(spread, self.function), self.by_elements)
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         leaves, structure = jax.tree.flatten((t, motion))
         leaves = jnp.broadcast_arrays(*leaves)
         if leaves[0].ndim == 0:
-            return self.input(t, motion)
+            return self.function(t, motion)
         moving = jax.tree.unflatten(structure, leaves)
-        arrays, static = eqx.partition(self.input, eqx.is_inexact_array)
+        arrays, static = eqx.partition(self.function, eqx.is_inexact_array)
 
         def of_ride(arrays: PyTree[Array], moving: Any) -> Any:
             return tuple(eqx.combine(joined(arrays), static)(*moving))

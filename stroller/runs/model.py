@@ -74,26 +74,17 @@ ENDS = {
 TAKEN = (*ENDS, "contact_time", "end_time", "status", "steps", "rejected")
 
 
-@dataclasses.dataclass(frozen=True)
-class Original:
-    """A user's input before it was traced, for files and for other processes. All are equal: the traced input decides
-    whether a program is compiled again."""
-
-    input: Input = dataclasses.field(compare=False)
-
-
 class RideModel(AbstractSceneModel):
     """A ride, or the rides of many cells: scene, launch and input, and the event. Without another event, the event is
     that the ground would have to pull; a ride continues through this event.
 
-    `original`: the user's input, if it was traced; `jumps`: times at which it jumps, apart from those found in it.
+    `jumps`: times at which the input jumps, apart from those found in it.
     """
 
     scene: Scene
     launch: Launch
     input: Any
     event: EventFunction | None = None
-    original: "Original | None" = eqx.field(static=True, default=None)
     jumps: tuple[Array, ...] = ()
 
     smooth, continues = True, True
@@ -108,27 +99,27 @@ class RideModel(AbstractSceneModel):
         The input becomes a module whose numbers are leaves, evaluated for single rides. A function, or a module with many
         numbers, is traced once.
         """
-        module, original, is_module = controls, None, isinstance(controls, eqx.Module)
+        is_module = isinstance(controls, eqx.Module)
         is_own = is_module and not (is_users(type(controls)) or inputs.has_arrays(controls))
         if not (controls is None or is_own or isinstance(controls, Held | Formula)):
             sizes = [np.size(leaf) for leaf in jax.tree.leaves(controls) if is_array(leaf)]
             if is_module and sum(sizes) <= inputs.MOST_ELEMENTS:
-                module = Held(parted(controls))
+                controls = Held(parted(controls))
             else:
-                module, original = Formula.of(controls, *inputs.example_arguments(scene, launch)), Original(controls)
-        ride = cls(scene=scene, launch=launch, input=module, original=original, jumps=inputs.as_jumps(jumps))
+                controls = Formula.of(controls, *inputs.example_arguments(scene, launch))
+        ride = cls(scene=scene, launch=launch, input=controls, jumps=inputs.as_jumps(jumps))
         return with_event(ride, event)
 
     def __reduce__(self) -> Any:
         # A traced function cannot be pickled, so each process traces it.
-        controls = self.input if self.original is None else self.original.input
+        controls = inputs.users_input(self.input)
         event = None if self.event is None else self.event.function
         return RideModel.of, (self.scene, self.launch, controls, event, self.jumps)
 
     @property
     def roots(self) -> dict[str, PyTree]:
         """The trees whose numbers are parameters."""
-        module = {} if self.input is None or self.original is not None else {"input": self.input}
+        module = {} if self.input is None or isinstance(self.input, Formula) else {"input": self.input}
         return {"scene": self.scene, "launch": self.launch} | module
 
     @property
@@ -157,7 +148,7 @@ class RideModel(AbstractSceneModel):
         return labels
 
     def description(self) -> dict[str, Any]:
-        controls: Any = self.input if self.original is None else self.original.input
+        controls = inputs.users_input(self.input)
         if isinstance(controls, eqx.Module):
             controls = description("input", controls)
         else:
