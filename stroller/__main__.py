@@ -29,7 +29,7 @@ from .planning.plan import Plan, plan, planned_stage
 from .planning.problem import Box, Goal, Limits
 from .runs.model import simulate
 from .runs.trajectory import Trajectory, table_of
-from .runs.view import grouped
+from .runs.view import stage_of_rides
 
 RIDES = ("without friction", "with friction")
 
@@ -179,13 +179,16 @@ def audited(options: argparse.Namespace, helm: Helm, ground: str) -> tuple[dict[
 
 def stages(parking: Plan, rides: dict[Name, Trajectory]) -> list[views.Stage]:
     """The stages of the page: the plan, and each ground with its rides."""
-    groups: dict[str, list[tuple[int, Trajectory]]] = {}
+    groups: dict[str, list[tuple[Trajectory, int, str]]] = {}
     # The plan has the first colour.
-    for number, ((ground, _), run) in enumerate(rides.items(), 1):
-        groups.setdefault(ground, []).append((number, run))
-    # The title of the stage names the ground of both rides; the name of each ride is beside it.
-    rides_by_ground = zip(groups, grouped(list(groups.values()), ["", *(ride for _, ride in rides)]), strict=True)
-    return [planned_stage(parking), *(stage._replace(title=ground) for ground, stage in rides_by_ground)]
+    for number, ((ground, ride), run) in enumerate(rides.items(), 1):
+        groups.setdefault(ground, []).append((run, number, ride))
+    all_stages = [planned_stage(parking)]
+    for ground, group in groups.items():
+        # The title of the stage names the ground of both rides; the name of each ride is beside it.
+        runs, *numbers_and_names = map(list, zip(*group, strict=True))
+        all_stages.append(stage_of_rides(runs[0], runs, *numbers_and_names)._replace(title=ground))
+    return all_stages
 
 
 def computed(options: argparse.Namespace) -> dict[str, bytes]:

@@ -31,7 +31,7 @@ from .friction import AbstractFriction, Coulomb, Viscous
 from .model.body import Top
 from .model.scene import Launch, Scene
 from .runs.verbs import inversion_table, simulate
-from .runs.view import Panel, draw_launches, frames, stages
+from .runs.view import Panel, draw_launches, frames, stage
 
 #: The paper's units in SI.
 GRAM, CENTIMETRE = 1e-3, 1e-2
@@ -291,11 +291,12 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[vie
     tilt = np.where(ends + 0.5 <= step, options.theta, np.inf)
     row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
     last = min(options.t1, step, float(ends[row]) + 0.5)
-    (times, runs), groups = drawn(options, last), []
-    for file, arena in arenas.items():
+    (times, runs), stages = drawn(options, last), []
+    for number, (file, arena) in enumerate(arenas.items()):
+        frames_of_row = jax.tree.map(lambda part: np.asarray(part)[row], runs[file])
         name = f"{arena.name}, θ(0) = {options.theta[row]:.4g} rad"
-        groups.append([(name, arena.scene, times, jax.tree.map(lambda part: np.asarray(part)[row], runs[file]))])
-    return stages(groups)
+        stages.append(stage([(arena.scene, times, frames_of_row)], [number], [name]))
+    return stages
 
 
 def write(options: argparse.Namespace) -> views.Outputs:

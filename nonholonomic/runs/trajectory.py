@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from .. import views
 from ..compilation.tracing import named_errors
 from ..hybrid import MOST_ROUNDS, hybrid_resets
+from ..hybrid.ensemble import OnlyMode
 from ..integration import AbstractProblem, Settings
 from ..integration.problem import Status, run_bounds
 from ..parameters import of_all_modes
@@ -25,8 +26,8 @@ from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown, unit_of
 from ..validation import IN_DEGREES, explaining, is_traced, require_all, require_file, require_one_run, times_within
-from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stages_of
-from ..views.explore import Frame, LiveRun, OnlyMode, Simulator, Slider, Summary, live_page
+from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stage_of
+from ..views.explore import Frame, LiveRun, Simulator, Slider, Summary, live_page
 from ..views.pages import require_labels
 from ..views.stage import Draw, Drawing, Parts, Wheel, meshes_of, of_grid
 from .model import AbstractModel, Names, Sliders, model_of, run_of
@@ -347,10 +348,12 @@ def frame_of(draw: Drawing, system: object, t: Array, state: Array, rate: Any = 
     return parts, jnp.stack(corners), frame
 
 
-def show_of(number: int, path: str, names: Sequence[str], size: float, drawn: tuple[np.ndarray, Parts, Frame]) -> Show:
+def show_of(
+    name: str, colour: int, path: str, names: Sequence[str], size: float, drawn: tuple[np.ndarray, Parts, Frame]
+) -> Show:
     """The drawing of a run. **Arguments:** `path`: name of its trace; `names`: those of its curves; `size`: that of the
     drawing [m]; `drawn`: the times, the parts and the frames."""
-    (t, parts, frame), colour = drawn, COLOURS[number % len(COLOURS)]
+    t, parts, frame = drawn
     solids = [part for part in parts if isinstance(part, Box | Wheel)]
     for part in solids:
         sizes = np.asarray(part.lengths if isinstance(part, Box) else part.radius)
@@ -366,14 +369,14 @@ def show_of(number: int, path: str, names: Sequence[str], size: float, drawn: tu
     )
     traces = (views.Trace(path, frame.traces[0][0], colour, WIDTH * size),)
     curves = tuple(map(views.Curve, names, frame.curves))
-    return Show(f"run {number + 1}", colour, t, frame.normal, size, bodies, traces, arrows, curves)
+    return Show(name, colour, t, frame.normal, size, bodies, traces, arrows, curves)
 
 
-def stage_of(numbers: Sequence[int], runs: list["Trajectory"]) -> tuple[Drawing, Stage]:
+def drawn_stage(runs: list["Trajectory"], numbers: Sequence[int], names: Sequence[str]) -> tuple[Drawing, Stage]:
     """The function that draws runs, and the stage that shows the first of them.
 
-    **Arguments:** `numbers`: those of the runs that the stage shows; `runs`: these runs, and others for which the ground must
-    have room.
+    **Arguments:** `runs`: these runs, and others for which the ground must have room; `numbers`, `names`: as for
+    `views.stage_of`, of the runs that the stage shows.
 
     **Raises:** `ValueError` for a batch of runs, a run without a finite state, and a function that draws NaN.
     """
@@ -401,8 +404,10 @@ def stage_of(numbers: Sequence[int], runs: list["Trajectory"]) -> tuple[Drawing,
     low, high = np.append(low[:2] - MARGIN * size, min(0.0, low[2])), high + MARGIN * size
     ground = np.array([(x, y, low[2]) for x in (low[0], high[0]) for y in (low[1], high[1])])
     arena = Arena(views.Mesh(ground, of_grid(2, 2)[:, ::-1], PALE), (), "", np.array([0.0, 0.0, 1.0]), axes)
-    shown_runs = zip(numbers, models, drawn, strict=False)
-    shows = tuple(show_of(number, path, model.names, size, of_run) for number, model, of_run in shown_runs)
+    shows = tuple(
+        show_of(name, COLOURS[number % len(COLOURS)], path, model.names, size, of_run)
+        for name, number, model, of_run in zip(names, numbers, models, drawn, strict=False)
+    )
     return draw, Stage(title, arena, shows, rise=RISE if models[0].draw else 2.0 * RISE)
 
 
@@ -663,8 +668,6 @@ def brief_names(values: dict[str, list[str]]) -> dict[str, str]:
     return {name: end if ends.count(end) == 1 else name for name, end in zip(names, ends, strict=True)}
 
 
-@stages_of.register(Trajectory)
-def _(run: Trajectory, runs: list[Trajectory], overlaid: bool, unit: Unit) -> list[Stage]:
-    whole = [(number, run._with_resets()) for number, run in enumerate(runs)]
-    groups = [whole] if overlaid else [[numbered] for numbered in whole]
-    return [stage_of(*map(list, zip(*group, strict=True)))[1] for group in groups]
+@stage_of.register(Trajectory)
+def _(run: Trajectory, runs: list[Trajectory], numbers: Sequence[int], names: Sequence[str]) -> Stage:
+    return drawn_stage([run._with_resets() for run in runs], numbers, names)[1]

@@ -566,10 +566,6 @@ class Tabular(Viewable, abc.ABC):
         """A table over the run's times with at least the named quantities, or with all if one of the names is unknown."""
         return self.to_table()
 
-    def labels_of(self, runs: list[Any], unit: str | Sequence[str] | None) -> list[str]:
-        """Labels that tell runs of this kind apart, in units as for `plot`; for a single run the title of its picture."""
-        return [""] if len(runs) == 1 else [f"run {k + 1}" for k in range(len(runs))]
-
     @status_line("drawing")
     def plot(
         self,

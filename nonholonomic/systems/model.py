@@ -22,7 +22,7 @@ from ..parameters import Parameters, checks_of, require_apart, short_names
 from ..runs.event import UNMEASURED
 from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
-from ..runs.trajectory import TOLERANCE, Trajectory, frame_of, live_run, page_of, runs_at_ends, sliders_of, stage_of
+from ..runs.trajectory import TOLERANCE, Trajectory, drawn_stage, frame_of, live_run, page_of, runs_at_ends, sliders_of
 from ..sweeps import Axis, Quantity, Variable
 from ..text import counted, name_of, shown
 from ..validation import as_number, is_traced
@@ -447,7 +447,7 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
         legal = (name for name in names if all(np.all(model.replaced({name: end}).legal()) for end in ends[name]))
         ranges = {name: ends[name] for name in [*itertools.islice(legal, DEFAULT_SLIDERS)] or names[:DEFAULT_SLIDERS]}
     sliders = sliders_of(model, ranges)
-    names, (draw, stage) = model.names, stage_of([0], runs_at_ends(model, sliders, t1))
+    names, (draw, stage) = model.names, drawn_stage(runs_at_ends(model, sliders, t1), [0], [""])
 
     def outcome(model: OwnModel, ended: HybridOutcome) -> tuple[Array, Array]:
         if model.has_event:

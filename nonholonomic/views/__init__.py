@@ -9,7 +9,7 @@ from .pages import page as page
 from .pages import page_of_job as page_of_job
 from .pages import picture_as_html as picture_as_html
 from .pages import run_job as run_job
-from .pages import stages_of as stages_of
+from .pages import stage_of as stage_of
 from .pages import table_as_html as table_as_html
 from .pages import without_motion as without_motion
 from .plot import draw_fit as draw_fit
@@ -34,7 +34,7 @@ from .stage import arena as arena
 from .stage import ball as ball
 from .stage import bar as bar
 from .stage import box as box
+from .stage import quaternion as quaternion
 from .stage import rod as rod
 from .stage import striped as striped
-from .stage import turned as turned
 from .stage import wheel as wheel

@@ -8,7 +8,7 @@ import json
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,16 +18,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..compilation.components import AbstractScalarReader, rows_along
 from ..compilation.xla_cpu import Equation, Program, called_program, opened, programs_of, traced
-from ..hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome, Transition
+from ..hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
 from ..hybrid.ensemble import after_reset, after_solve, at_start, mode_numbered, program_groups
-from ..integration import AbstractProblem, Lanes, LaneState, Settings, States, explicit_tableau
+from ..integration import AbstractProblem, Lanes, LaneState, Settings, explicit_tableau
 from ..integration.problem import LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ..integration.runge_kutta import Step, inner_stages, middle_weights, watched_places
 from ..integration.scheduler import LaneScheduler, back_to_margin, outcome_of, with_crossing_times
 from ..integration.step import Control, after_step, length_to_try, looks_of
 from ..text import Unit
 from .pages import Page, page, script, template
-from .stage import Stage, converted, curves_in
+from .stage import Kind, Stage, converted, curves_in
 
 # Convert a function that JAX can trace to a JavaScript function of the same numbers.
 #
@@ -347,9 +347,6 @@ def _strings(numbers: Sequence[Number]) -> list[str]:
 
 # The contents of a page at one time of a run, in the form for the player (`player.js`).
 
-#: JAX's arrays for a page, or NumPy's for a picture.
-Kind = TypeVar("Kind", Array, np.ndarray)
-
 
 class Frame(NamedTuple, Generic[Kind]):
     """One moment of a run, or several, with bodies, traces, arrows and curves in the order of the `Show` of the page.
@@ -366,28 +363,6 @@ class Frame(NamedTuple, Generic[Kind]):
     arrows: tuple[tuple[Float[Kind, "*times 3"], Float[Kind, "*times 3"]], ...]
     curves: tuple[Float[Kind, "*times"], ...]
     turning_rate: Float[Kind, "*times"]
-
-
-def quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
-    """The quaternion (x, y, z, w) of a rotation matrix, from its largest component (Shepperd 1978)."""
-    m, trace = rotation, rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
-    # Four times the products of the quaternion's components, one row each.
-    skew = (m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
-    symmetric = (m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1])
-    squares = [1.0 - trace + 2.0 * m[k, k] for k in range(3)]
-    rows = jnp.stack(
-        [
-            jnp.stack([squares[0], symmetric[0], symmetric[1], skew[0]]),
-            jnp.stack([symmetric[0], squares[1], symmetric[2], skew[1]]),
-            jnp.stack([symmetric[1], symmetric[2], squares[2], skew[2]]),
-            jnp.stack([*skew, 1.0 + trace]),
-        ]
-    )
-    row = rows[0]
-    for k in range(1, 4):
-        # `row` is the largest of the first k compared rows.
-        row = jnp.where(rows[k, k] > jnp.max(jnp.stack([rows[j, j] for j in range(k)])), rows[k], row)
-    return row / jnp.sqrt(jnp.sum(row * row))
 
 
 # The steps of a smooth motion for integration in the browser: their functions and their method, in JavaScript.
@@ -476,19 +451,6 @@ def offsets_of(parts: LaneState | HybridOutcome) -> dict[str, int]:
 # A run through modes for integration in the browser.
 #
 # Only the loops over rounds and over the stretches of a transition are written by hand, in `integrator.js`.
-
-
-class OnlyMode(AbstractBatchedMode):
-    """The mode of a smooth run, which ends where its `motion` leaves the domain."""
-
-    motion: AbstractProblem
-
-    def problem(self, state: States) -> AbstractProblem:
-        return self.motion
-
-    def reset_map(self, state: States, left: Lanes) -> Transition:
-        zero, none = jnp.zeros_like(left), jnp.zeros(left.shape, int)
-        return Transition(none, state, zero, none + LEFT_DOMAIN, zero + jnp.inf, none[None])
 
 
 Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]

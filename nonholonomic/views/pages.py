@@ -300,11 +300,11 @@ views.ready.then((player) => player.film([REQUEST], (share) => { post("share", S
 
 
 @functools.singledispatch
-def stages_of(run: Any, runs: list[Any], overlaid: bool, unit: Unit) -> list[Stage]:
-    """The stages on which runs of one kind are drawn: one for each, or a common one for overlaid runs.
+def stage_of(run: Any, runs: list[Any], numbers: Sequence[int], names: Sequence[str]) -> Stage:
+    """The stage on which runs of one kind are drawn together.
 
-    Each kind of run registers its own function. **Arguments:** `run`: the first of the `runs`; `unit`: unit of the numbers
-    in their names, as for `plot`.
+    Each kind of run registers its own function. **Arguments:** `run`: the first of the `runs`; `numbers`: those of the runs
+    among all on a page, which have different colours; `names`: the names of the runs.
     """
     raise NotImplementedError(f"{type(run).__name__} has no picture")
 
@@ -315,19 +315,21 @@ class Viewable:
     #: What pictures and pages mark in the curves.
     marks: ClassVar[Marks] = ()
 
+    def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
+        """Labels that tell runs of this kind apart, in units as for `plot`; for a single run the title of its picture."""
+        return [""] if len(runs) == 1 else [f"run {k + 1}" for k in range(len(runs))]
+
     def stages(
         self, others: Sequence[Any] = (), overlaid: bool = False, unit: Unit = None, label: Label = None
     ) -> list[Stage]:
-        """This run and others as stages; arguments as for `stages_of` and `view`."""
+        """This run and others as stages, one for each or a common one; arguments as for `view`."""
         runs, stages = [self, *others], []
-        named = iter(zip(runs, [None] * len(runs) if label is None else require_labels(label, runs), strict=True))
-        for stage in stages_of(self, runs, overlaid, unit):
-            shows = tuple(
-                show._replace(name=text or show.name, marks=run.marks)
-                for show, (run, text) in zip(stage.shows, named, strict=False)
-            )
-            title = stage.title if label is None else "; ".join(show.name for show in shows)
-            stages.append(stage._replace(title=title, shows=shows))
+        names = self.labels_of(runs, unit) if label is None else require_labels(label, runs)
+        for group in [range(len(runs))] if overlaid else [[number] for number in range(len(runs))]:
+            stage = stage_of(self, [runs[k] for k in group], group, [names[k] for k in group])
+            shows = (show._replace(marks=runs[k].marks) for k, show in zip(group, stage.shows, strict=True))
+            title = stage.title if label is None else "; ".join(names[k] for k in group)
+            stages.append(stage._replace(title=title, shows=tuple(shows)))
         return stages
 
     @status_line("drawing")
@@ -443,7 +445,7 @@ def require_others(run: object, others: Any) -> Sequence[Any]:
     if not isinstance(others, list | tuple):
         raise ValueError(f"others = {shown(others)} must be a list of runs, such as [run]")
     for k, other in enumerate(others):
-        if stages_of.dispatch(type(other)) is not stages_of.dispatch(type(run)):
+        if stage_of.dispatch(type(other)) is not stage_of.dispatch(type(run)):
             raise ValueError(f"others[{k}] = {shown(other)} must be a run of the same package, as simulate returns it")
     return others
 

@@ -5,7 +5,7 @@ seconds.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +16,9 @@ from ..geometry import AbstractSurface
 from ..text import Unit, in_unit, require_unit_of
 
 Points = Float[np.ndarray, "times 3"]
+
+#: JAX's arrays for a page, or NumPy's for a picture.
+Kind = TypeVar("Kind", Array, np.ndarray)
 
 #: Times [s] that curves mark, and what they are, such as (1.2, "turned over at 1.2 s").
 Marks = tuple[tuple[float, str], ...]
@@ -184,12 +187,25 @@ def css(colour: int) -> str:
     return f"#{colour:06x}"
 
 
-def turned(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times 4"]:
-    """Quaternions (x, y, z, w) of rotation matrices."""
-    # Imported here, because most commands draw nothing.
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(np.asarray(rotation, dtype=float)).as_quat()
+def quaternion(rotation: Float[Kind, "*times 3 3"]) -> Float[Kind, "*times 4"]:
+    """The quaternions (x, y, z, w) of rotation matrices, from their largest components (Shepperd 1978)."""
+    xp, m = rotation.__array_namespace__(), [[rotation[..., i, j] for j in range(3)] for i in range(3)]
+    trace = m[0][0] + m[1][1] + m[2][2]
+    # Four times the products of the quaternion's components, one row each.
+    skew = (m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1])
+    symmetric = (m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1])
+    squares = [1.0 - trace + 2.0 * m[k][k] for k in range(3)]
+    rows = [
+        xp.stack([squares[0], symmetric[0], symmetric[1], skew[0]], axis=-1),
+        xp.stack([symmetric[0], squares[1], symmetric[2], skew[1]], axis=-1),
+        xp.stack([symmetric[1], symmetric[2], squares[2], skew[2]], axis=-1),
+        xp.stack([*skew, 1.0 + trace], axis=-1),
+    ]
+    row, largest = rows[0], rows[0][..., 0]
+    for k in range(1, 4):
+        square = rows[k][..., k]
+        row, largest = xp.where((square > largest)[..., None], rows[k], row), xp.maximum(square, largest)
+    return row / xp.sqrt(xp.sum(row * row, axis=-1, keepdims=True))
 
 
 # Meshes of simple solids, in a body's own axes.

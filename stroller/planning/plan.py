@@ -536,7 +536,7 @@ def planned_stage(plan: Plan) -> Stage:
     # Thin bands along the candidates, and upright prisms on the outlines, each with a lid of triangles about its middle.
     ribbons, blocks = [], []
     for line in lines:
-        normal = normals(np, problem.scene, line)
+        normal = normals(problem.scene, line)
         across = np.cross(normal, np.gradient(line, axis=0))
         across *= THIN * length / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
         above = line + RAISED * length * normal

@@ -3,8 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,16 +19,14 @@ from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, pag
 from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit
 from nonholonomic.validation import explaining
-from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
+from nonholonomic.views.explore import Frame, LiveRun, Summary
+from nonholonomic.views.stage import Kind
 
 from ..model.dynamics import State
 from ..model.input import Input
 from ..model.scene import DRIVES, Launch, RideProblem, Scene
 from .model import RideModel, checked_model
 from .trajectory import MOST_GRIP, QUANTITIES, RideState, Trajectory
-
-#: JAX's arrays for a page, or NumPy's for a picture.
-Values = TypeVar("Values", Array, np.ndarray)
 
 # The drawing of a ride: the vehicle, the traces of its wheels, forces, and curves over time.
 
@@ -66,20 +63,13 @@ CURVES = {"speed": "speed [m/s]", "steering": "steering angle [rad]", "energy": 
 CURVES |= {"normal_force": "normal force [N]"}
 
 
-@views.stages_of.register(Trajectory)
-def _(run: Trajectory, runs: list[Trajectory], overlaid: bool, unit: Unit) -> list[views.Stage]:
-    numbered = list(enumerate(runs))
-    return grouped([numbered] if overlaid else [[ride] for ride in numbered], run.labels_of(runs, unit))
-
-
-def grouped(groups: list[list[tuple[int, Trajectory]]], names: list[str]) -> list[views.Stage]:
-    """A stage for each group of numbered rides on a common ground; `names` are the names of the rides."""
-    stages = []
-    for group in groups:
-        shows = tuple(show(run, k, names[k]) for k, run in group)
-        ground = ground_of([run for _, run in group], shows[0].normal[0])
-        stages.append(views.Stage("; ".join(body.name for body in shows), ground, shows))
-    return stages
+@views.stage_of.register(Trajectory)
+def stage_of_rides(
+    run: Trajectory, rides: list[Trajectory], numbers: Sequence[int], names: Sequence[str]
+) -> views.Stage:
+    """The stage of rides on a common ground."""
+    shows = tuple(show(ride, number, name) for ride, number, name in zip(rides, numbers, names, strict=True))
+    return views.Stage("; ".join(names), ground_of(rides, shows[0].normal[0]), shows)
 
 
 def ground_of(rides: list[Trajectory], normal: np.ndarray, *more: np.ndarray) -> views.Arena:
@@ -89,26 +79,24 @@ def ground_of(rides: list[Trajectory], normal: np.ndarray, *more: np.ndarray) ->
     return views.arena(scene.surface, points, normal, 3.0 * length, length)
 
 
-def normals(xp: ModuleType, scene: Scene, position: Values) -> Values:
-    """Unit normals of the ground at positions (*times, 3), towards the stroller. **Arguments:** `xp`: NumPy for a picture, or
-    `jax.numpy` for a page."""
-    surface, zero = scene.surface, xp.zeros(position.shape[:-1])
+def normals(scene: Scene, position: Kind) -> Kind:
+    """Unit normals of the ground at positions (*times, 3), towards the stroller."""
+    xp, surface = position.__array_namespace__(), scene.surface
+    zero = xp.zeros(position.shape[:-1])
     components = surface.normal(surface.in_own_axes(tuple(position.T)))
     filled = tuple(zero if part is None else xp.asarray(part) + zero for part in components)
     outward = xp.stack([xp.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
     return surface.sign(scene.side, DRIVES) * outward
 
 
-def drawn(
-    xp: ModuleType, length: Array | float, normal: Values, values: dict[str, Values], angles: Sequence[Values] | Values
-) -> tuple[list[tuple[Values, Values]], list[Values], list[tuple[Values, Values]]]:
-    """What is drawn of a vehicle: the place and the rotation of each of `PARTS`; the points of `TRACES`; and start and vector
-    of each of `FORCES`.
+def frame_of(scene: Scene, normal: Kind, values: dict[str, Kind], angles: Sequence[Kind] | Kind) -> Frame[Kind]:
+    """What is drawn of a ride: `PARTS`, `TRACES`, `FORCES` and `CURVES`.
 
-    **Arguments:** `xp`: as for `normals`; `length`: the wheelbase [m]; `normal`: that of the ground; `values`: the quantities
-    of a ride (*times, ...); `angles` [rad] by which left, right and front wheel have rolled.
+    **Arguments:** `normal`: that of the ground; `values`: the quantities `SHOWN` (*times, ...); `angles` [rad] by which left,
+    right and front wheel have rolled.
     """
-    position = values["position"]
+    xp, position = normal.__array_namespace__(), values["position"]
+    length = xp.asarray(scene.body.wheelbase)
     x = values["direction"] / xp.linalg.norm(values["direction"], axis=-1, keepdims=True)
     y = xp.cross(normal, x)
     y = y / xp.linalg.norm(y, axis=-1, keepdims=True)
@@ -117,21 +105,29 @@ def drawn(
     forward, left = cosine * x + sine * y, cosine * y - sine * x
     radius, half = RADIUS * length, 0.5 * TRACK * length
     axle, front = position + radius * z, position + length * x + radius * z
-    bodies = [(axle, xp.stack([x, y, z], axis=-1))]
+    bodies = [(axle, views.quaternion(xp.stack([x, y, z], axis=-1)))]
     ends = ((axle + half * y, x, y), (axle - half * y, x, y), (front, forward, left))
     for (place, ahead, axis), angle in zip(ends, angles, strict=True):
         cosine, sine = xp.cos(angle)[..., None], xp.sin(angle)[..., None]
-        bodies.append((place, xp.stack([cosine * ahead - sine * z, axis, sine * ahead + cosine * z], axis=-1)))
+        rotation = xp.stack([cosine * ahead - sine * z, axis, sine * ahead + cosine * z], axis=-1)
+        bodies.append((place, views.quaternion(rotation)))
     # Above the ground, where lines are visible.
     contacts = [position + 0.02 * radius * z, position + length * x + 0.02 * radius * z]
     forces = [(contact, values["load"][..., k, None] * z) for k, contact in enumerate(contacts)]
     lefts = zip(contacts, (y, left), strict=True)
     forces += [(contact, values["side_force"][..., k, None] * axis) for k, (contact, axis) in enumerate(lefts)]
-    return bodies, contacts, forces
+    return Frame(
+        normal=normal,
+        bodies=tuple(bodies),
+        traces=tuple((contact, None) for contact in contacts),
+        arrows=tuple(forces),
+        curves=tuple(values[name] for name in CURVES),
+        turning_rate=xp.maximum(xp.abs(values["speed"]), xp.abs(values["front_speed"])) / radius,
+    )
 
 
 def show(run: Trajectory, number: int, name: str) -> views.Show:
-    """The drawing of one ride, the `number`-th of all."""
+    """The drawing of one ride, the `number`-th of a page."""
     from scipy.integrate import cumulative_trapezoid
 
     scene = run.model.scene
@@ -140,16 +136,13 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
     times, reader = refined(run, radius)
     speeds = (np.asarray(run.speed) - yaw, np.asarray(run.speed) + yaw, np.asarray(run.front_speed))
     angles = [reader(cumulative_trapezoid(speed / radius, np.asarray(run.t), initial=0.0)) for speed in speeds]
-    values, normal = {name: reader(run[name]) for name in SHOWN}, reader(normals(np, scene, np.asarray(run.position)))
-    bodies, points, forces = drawn(np, length, normal, values, angles)
+    values, normal = {name: reader(run[name]) for name in SHOWN}, reader(normals(scene, np.asarray(run.position)))
+    frame = frame_of(scene, normal, values, angles)
     wheel_mesh = views.wheel(radius, WIDTH * length, (views.DARK, views.PALE))
     meshes = (vehicle(length, colour), wheel_mesh, wheel_mesh, wheel_mesh)
     scale, width = WEIGHT * length / float(scene.body.mass * scene.gravity), 0.035 * length
     grip = np.asarray(run["grip"])[:, : len(run.loaded_axles)]
-    curves = [views.Curve(label, values[quantity]) for quantity, label in CURVES.items()]
-    curves.append(
-        views.Curve("friction that the tyres need [1]", reader(np.minimum(np.round(grip, 12), DRAWN_GRIP)).max(axis=-1))
-    )
+    needed = reader(np.minimum(np.round(grip, 12), DRAWN_GRIP)).max(axis=-1)
     warning = f"needs friction {np.max(grip):.2g}, more than any tyre provides: a real stroller would slip"
     return views.Show(
         name,
@@ -157,21 +150,21 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
         times,
         normal,
         SIZE * length,
+        tuple(views.Body(part, *pose, mesh) for part, pose, mesh in zip(PARTS, frame.bodies, meshes, strict=True)),
         tuple(
-            views.Body(part, place, views.turned(rotation), mesh)
-            for part, (place, rotation), mesh in zip(PARTS, bodies, meshes, strict=True)
-        ),
-        tuple(
-            views.Trace(label, line, colour, share * length)
-            for (label, colour, share), line in zip(TRACES, points, strict=True)
+            views.Trace(label, points, colour, share * length)
+            for (label, colour, share), (points, _) in zip(TRACES, frame.traces, strict=True)
         ),
         tuple(
             views.Arrow(
                 label, start, vector, "N", scale, colour, width, limit and limit * length, through=limit is None
             )
-            for (label, colour, limit), (start, vector) in zip(FORCES, forces, strict=True)
+            for (label, colour, limit), (start, vector) in zip(FORCES, frame.arrows, strict=True)
         ),
-        tuple(curves),
+        (
+            *map(views.Curve, CURVES.values(), frame.curves),
+            views.Curve("friction that the tyres need [1]", needed),
+        ),
         warning if np.max(grip) > MOST_GRIP else "",
     )
 
@@ -279,6 +272,12 @@ def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[
         """A ride of one cell with the rolling angles of its wheels."""
         return ExtendedProblem(model.problem(1, None), WheelAngles(), jnp.zeros((3, 1)), jnp.ones((3, 1)))
 
+    def frame(drawn: RideModel, time: Array, rows: Float[Array, "rows 1"], mode: object) -> Frame[Array]:
+        # The rows end with the rolling angles of the wheels.
+        state = RideState(drawn.scene, drawn.input, time, rows[:-3])
+        values = {name: QUANTITIES[name].of(name, state)[0] for name in SHOWN}
+        return frame_of(drawn.scene, normals(drawn.scene, values["position"]), values, rows[-3:, 0])
+
     knobs = sliders_of(model, default_ranges(model.scene, model.launch) if sliders is None else sliders)
     live = live_run(
         model,
@@ -286,7 +285,7 @@ def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[
         knobs,
         t1,
         outcome,
-        lambda drawn, time, rows, mode: frame(drawn.scene, drawn.input, time, rows),
+        frame,
         title=f"Stroller on a {type(model.scene.surface).__name__.lower()}",
         answer=("distance from the start", "m"),
         summaries=(Summary("speed", "m/s", 0), Summary("energy", "J", 2)),
@@ -333,21 +332,3 @@ def outcome(model: RideModel, ended: HybridOutcome) -> tuple[Int[Array, ""], Flo
     status = model.ended(ended, TOLERANCE)[0]
     status = jnp.where(status == int(Status.EVENT), int(Status.CONTACT_LOST), status)
     return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
-
-
-def frame(scene: Scene, controls: Input | None, time: Array, rows: Float[Array, "rows 1"]) -> Frame:
-    """The drawn quantities of a stroller at one time, in the order of `show`. The rows end with the rolling angles of
-    the wheels."""
-    state = RideState(scene, controls, time, rows[:-3])
-    values = {name: QUANTITIES[name].of(name, state)[0] for name in SHOWN}
-    normal = normals(jnp, scene, values["position"])
-    bodies, points, forces = drawn(jnp, scene.body.wheelbase, normal, values, rows[-3:, 0])
-    fastest = jnp.maximum(jnp.abs(values["speed"]), jnp.abs(values["front_speed"]))
-    return Frame(
-        normal=normal,
-        bodies=tuple((place, quaternion(rotation)) for place, rotation in bodies),
-        traces=tuple((point, None) for point in points),
-        arrows=tuple(forces),
-        curves=tuple(values[name] for name in CURVES),
-        turning_rate=fastest / (RADIUS * scene.body.wheelbase),
-    )

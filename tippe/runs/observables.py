@@ -74,26 +74,6 @@ def quantities_of(scene: Scene) -> dict[str, Quantity]:
     return QUANTITIES | OF_RIGID_BODIES if isinstance(scene.body, AbstractRigidBody) else QUANTITIES
 
 
-def names_of(runs: list[Any], unit: Unit = None) -> list[str]:
-    """Names of runs, by what differs in their launches and scenes. **Arguments:** `unit`: as for `plot`."""
-    for run in runs:
-        require_one_run(run, "a picture", ", and pass the others as others=")
-    (angle, per_angle), (rate, per_rate) = (in_unit(si, unit) for si in ("rad", "rad/s"))
-    scenes = [run.scene for run in runs]
-    tops = [
-        next((f"{name} top" for name, top in TOPS.items() if eqx.tree_equal(top(), s.body)), "own top") for s in scenes
-    ]
-    starts = [
-        (f"θ(0) = {per_angle * float(run.theta[0]):.3g} {angle}", f"{per_rate * float(run.spin[0]):.4g} {rate}")
-        for run in runs
-    ]
-    if tops.count("own top") < min(2, len(runs)):
-        # The names of presets say more than their numbers.
-        starts = [(top, *start) for top, start in zip(tops, starts, strict=True)]
-        scenes = [eqx.tree_at(lambda scene: scene.body, scene, scenes[0].body) for scene in scenes]
-    return distinguishing_labels(starts, scenes, unit=unit)
-
-
 # The run of a top: one state at each time.
 
 
@@ -305,7 +285,24 @@ class AbstractTrajectory(AbstractRun):
         return run_table(quantities, coords, values, ["time"], request)
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
-        return names_of(runs, unit)
+        # By what differs in their launches and scenes.
+        for run in runs:
+            require_one_run(run, "a picture", ", and pass the others as others=")
+        (angle, per_angle), (rate, per_rate) = (in_unit(si, unit) for si in ("rad", "rad/s"))
+        scenes = [run.scene for run in runs]
+        tops = [
+            next((f"{name} top" for name, top in TOPS.items() if eqx.tree_equal(top(), s.body)), "own top")
+            for s in scenes
+        ]
+        starts = [
+            (f"θ(0) = {per_angle * float(run.theta[0]):.3g} {angle}", f"{per_rate * float(run.spin[0]):.4g} {rate}")
+            for run in runs
+        ]
+        if tops.count("own top") < min(2, len(runs)):
+            # The names of presets say more than their numbers.
+            starts = [(top, *start) for top, start in zip(tops, starts, strict=True)]
+            scenes = [eqx.tree_at(lambda scene: scene.body, scene, scenes[0].body) for scene in scenes]
+        return distinguishing_labels(starts, scenes, unit=unit)
 
     @property
     def marks(self) -> Marks:

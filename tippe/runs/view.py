@@ -24,7 +24,7 @@ from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, pag
 from nonholonomic.sweeps import chunk_for
 from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit, readable_unit
-from nonholonomic.views.explore import Frame, LiveRun, Summary, quaternion
+from nonholonomic.views.explore import Frame, LiveRun, Summary
 
 from ..friction import NoSlip
 from ..model.body import AbstractBody, Top
@@ -33,7 +33,7 @@ from ..model.scene import Launch, Scene
 from ..modes.plane import Slide
 from ..modes.problems import event_of
 from .model import TopModel, of_launches
-from .observables import OF_RIGID_BODIES, QUANTITIES, AbstractTrajectory, names_of
+from .observables import OF_RIGID_BODIES, QUANTITIES, AbstractTrajectory
 from .verbs import check_reversible, check_run
 
 # The drawing of a run: body, trace of the contact, path of the axis, arrows, and curves over time.
@@ -80,7 +80,7 @@ def frames(run: AbstractTrajectory) -> Frame[Array]:
     rotation = (run.angular_velocity * normal).sum(axis=-1) if isinstance(body, AbstractRigidBody) else run.jellett
     return Frame(
         normal=normal,
-        bodies=((position, jax.vmap(quaternion)(run.rotation)),),
+        bodies=((position, views.quaternion(run.rotation)),),
         traces=((above, None), (AXIS * radius * axis, position)),
         arrows=(
             (above, run.normal_force[:, None] * normal),
@@ -111,7 +111,7 @@ def motion(run: AbstractTrajectory) -> tuple[np.ndarray, Frame[np.ndarray]]:
 
 
 def show(scene: Scene, times: np.ndarray, frames: Frame[np.ndarray], number: int, name: str) -> views.Show:
-    """The drawing of one run, the `number`-th of its stage."""
+    """The drawing of one run, the `number`-th of a page."""
     body, colour, (theta, *_) = scene.body, views.COLOURS[number % len(views.COLOURS)], frames.curves
     times, frames = jax.tree.map(lambda part: part[np.isfinite(theta)], (times, frames))
     radius, weight = float(body.size), float(body.mass * scene.gravity)
@@ -143,24 +143,22 @@ def show(scene: Scene, times: np.ndarray, frames: Frame[np.ndarray], number: int
     )
 
 
-@views.stages_of.register(AbstractTrajectory)
-def _(run: AbstractTrajectory, runs: list[AbstractTrajectory], overlaid: bool, unit: Unit) -> list[views.Stage]:
-    drawn = [(name, run.scene, *motion(run)) for name, run in zip(names_of(runs, unit), runs, strict=True)]
-    return stages([drawn] if overlaid else [[one] for one in drawn])
+@views.stage_of.register(AbstractTrajectory)
+def _(
+    run: AbstractTrajectory, runs: list[AbstractTrajectory], numbers: Sequence[int], names: Sequence[str]
+) -> views.Stage:
+    return stage([(run.scene, *motion(run)) for run in runs], numbers, names)
 
 
-def stages(groups: list[list[tuple[str, Scene, np.ndarray, Frame[np.ndarray]]]]) -> list[views.Stage]:
-    """A stage for each group of runs on a common arena, with their names, times and drawn quantities; all runs have different
-    colours."""
-    all_stages, number = [], 0
-    for group in groups:
-        _, scene, _, first = group[0]
-        ground = arena_of(scene, [frames for *_, frames in group], first.normal[0])
-        drawn = enumerate(group, number)
-        shows = tuple(show(of_run, times, frames, k, name) for k, (name, of_run, times, frames) in drawn)
-        all_stages.append(views.Stage("; ".join(show.name for show in shows), ground, shows))
-        number += len(group)
-    return all_stages
+def stage(
+    drawn: list[tuple[Scene, np.ndarray, Frame[np.ndarray]]], numbers: Sequence[int], names: Sequence[str]
+) -> views.Stage:
+    """The stage of runs on a common arena. **Arguments:** `drawn`: scene, times and drawn quantities of each run; the others
+    as for `views.stage_of`."""
+    scene, _, first = drawn[0]
+    ground = arena_of(scene, [frames for *_, frames in drawn], first.normal[0])
+    shows = tuple(show(*run, number, name) for run, number, name in zip(drawn, numbers, names, strict=True))
+    return views.Stage("; ".join(names), ground, shows)
 
 
 def arena_of(scene: Scene, runs: list[Frame[np.ndarray]], normal: np.ndarray, margin: float = 0.0) -> views.Arena:

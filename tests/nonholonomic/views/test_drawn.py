@@ -25,7 +25,7 @@ from nonholonomic.views import (
     arena,
     ball,
     page,
-    turned,
+    quaternion,
 )
 from nonholonomic.views.pages import Viewable, draw_curves
 
@@ -63,7 +63,7 @@ def rolling(surface=None) -> Stage:
     rotation = np.moveaxis(np.array(rows), -1, 0)
     position = np.stack([radius * times, zero, zero + radius], axis=-1)
     foot = position * [1.0, 1.0, 0.0]
-    body = Body("ball", position, turned(rotation), ball(radius, (0xC8412B, 0xF4E9D2)))
+    body = Body("ball", position, quaternion(rotation), ball(radius, (0xC8412B, 0xF4E9D2)))
     np.testing.assert_allclose(Rotation.from_quat(body.orientation).as_matrix(), rotation, atol=1e-14)
     show = Show(
         "a ball",
