@@ -27,7 +27,7 @@ from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown, unit_of
 from ..validation import IN_DEGREES, explaining, is_traced, require_all, require_file, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stage_of
-from ..views.explore import Frame, LiveRun, Simulator, Slider, Summary, live_page
+from ..views.explore import Frame, LiveRun, Simulator, Slider, live_page
 from ..views.pages import require_labels
 from ..views.stage import Draw, Drawing, Parts, Wheel, meshes_of, of_grid
 from .model import AbstractModel, Names, Sliders, model_of, run_of
@@ -221,7 +221,7 @@ def live_run(
     title: str,
     answer: tuple[str, str],
     words: Mapping[int, str] | None = None,
-    summaries: tuple[Summary, ...],
+    summaries: tuple[int, ...],
     motion: Callable[[Any], AbstractProblem] | None = None,
 ) -> LiveRun:
     """The contents of a page of any model.
@@ -361,7 +361,7 @@ def show_of(
             raise ValueError(f"draw: the size of a {type(part).__name__} must not change in time; its place may")
     meshes = [(), *(meshes_of(part, colour) for part in jax.tree.map(lambda leaf: leaf[0], solids))]
     poses = zip(frame.bodies, meshes, strict=True)
-    bodies = tuple(views.Body("part", place, orientation, mesh) for (place, orientation), mesh in poses)
+    bodies = tuple(views.Body(*pose, mesh) for pose, mesh in poses)
     lines = zip([part for part in parts if isinstance(part, Line)], frame.arrows, strict=True)
     arrows = tuple(
         views.Arrow("line", begin, vector, "", 1.0, line.colour, 0.5 * (line.width or WIDTH * size))

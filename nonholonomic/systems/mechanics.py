@@ -13,6 +13,7 @@ At the end of the file are the rules by which a run may start.
 """
 
 import abc
+import functools
 import inspect
 from collections.abc import Callable
 from types import ModuleType
@@ -343,46 +344,27 @@ def is_driven(system: object) -> bool:
     return is_mechanical and (is_own(system, "drift") or any(takes_time(system, name) for name in TIMED))
 
 
-class SystemAtTime(AbstractSystem):
+class SystemAtTime:
     """A system at one time [s], whose functions are those of the coordinates and rates alone."""
 
-    system: AbstractSystem
-    time: Number
+    def __init__(self, system: AbstractSystem, time: Number):
+        self.system, self.time = system, time
 
-    @property
-    def dimension(self) -> int:
-        return self.system.dimension
-
-    def value(self, name: str, *arguments: Coordinates) -> Array:
-        """The value of a function of the system at the time."""
-        if not is_own(self.system, name):
-            return getattr(super(), name)(*arguments)
-        method = getattr(self.system, name)
-        return method(self.time, *arguments) if takes_time(self.system, name) else method(*arguments)
-
-    def metric(self, q: Coordinates) -> Float[Array, "n n"]:
-        return self.value("metric", q)
-
-    def potential(self, q: Coordinates) -> Float[Array, ""]:
-        return self.value("potential", q)
-
-    def constraints(self, q: Coordinates) -> Float[Array, "k n"]:
-        return self.value("constraints", q)
-
-    def drift(self, q: Coordinates) -> Float[Array, " k"]:
-        return self.value("drift", q)
-
-    def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
-        return self.value("lagrangian", q, rate)
+    def __getattr__(self, name: str) -> Callable[..., Array]:
+        if name in TIMED and is_own(self.system, name):
+            function = getattr(self.system, name)
+            return functools.partial(function, self.time) if takes_time(self.system, name) else function
+        # Any other function of a system, such as the energy, calls those at the time.
+        return getattr(AbstractSystem, name).__get__(self)
 
 
-def at_time(system: AbstractSystem, t: Number) -> AbstractSystem:
+def at_time(system: AbstractSystem, t: Number) -> AbstractSystem | SystemAtTime:
     """A system whose functions are those of the coordinates and rates alone: the system itself if none depends on time."""
     return SystemAtTime(system, t) if any(takes_time(system, name) for name in TIMED) else system
 
 
 def within_constraints(
-    system: AbstractSystem, q: Coordinates, rate: Coordinates, is_impulse: bool = False
+    system: AbstractSystem | SystemAtTime, q: Coordinates, rate: Coordinates, is_impulse: bool = False
 ) -> Coordinates:
     """The rates closest to some rates, in the kinetic metric, that the constraints allow.
 
@@ -392,9 +374,8 @@ def within_constraints(
     if not W.shape[0]:
         return rate
     per_impulse = solve(with_constraints(system.metric(q), W), W.T, positive=True)
-    has_drift = is_own(system, "drift") and not is_impulse
-    per_multiplier, excess = W @ per_impulse, W @ rate - system.drift(q) if has_drift else W @ rate
-    return rate - per_impulse @ solve(per_multiplier, excess, positive=True)
+    excess = W @ rate if is_impulse else W @ rate - system.drift(q)
+    return rate - per_impulse @ solve(W @ per_impulse, excess, positive=True)
 
 
 def with_constraints(metric: Float[Array, "n n"], W: Float[Array, "k n"]) -> Float[Array, "n n"]:
@@ -436,10 +417,8 @@ class AbstractFormulation(AbstractMode):
     - `input`: a function u(t, q, q') -> (ports,) that acts through the ports of the system, or `None`, the default.
     """
 
-    system: eqx.AbstractVar[AbstractSystem]
-
-    #: For formulations without an input.
-    input: ClassVar[Input | None] = None
+    system: AbstractSystem
+    input: Input | None = eqx.field(default=None, kw_only=True)
 
     #: Whether states may have rates that violate the constraints, so that `entered` changes them.
     is_projected: ClassVar[bool] = False
@@ -498,9 +477,6 @@ class Hamel(AbstractFormulation):
     **Arguments:** as for `AbstractFormulation`.
     """
 
-    system: AbstractSystem
-    input: Input | None = eqx.field(default=None, kw_only=True)
-
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
         rate = within_constraints(self.system, q, rate)
         return jnp.concatenate([q, solve(self.system.frame(q), rate)[: self.system.freedom]])
@@ -543,9 +519,6 @@ class Lagrange(AbstractFormulation):
 
     **Arguments:** as for `AbstractFormulation`.
     """
-
-    system: AbstractSystem
-    input: Input | None = eqx.field(default=None, kw_only=True)
 
     @property
     def is_projected(self) -> bool:

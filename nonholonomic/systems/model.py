@@ -4,14 +4,14 @@ import dataclasses
 import functools
 import itertools
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..compilation.tracing import dependent_outputs, named_errors, with_own_numbers
 from ..compilation.xla_cpu import Function
@@ -27,7 +27,7 @@ from ..sweeps import Axis, Quantity, Variable
 from ..text import counted, name_of, shown
 from ..validation import as_number, is_traced
 from ..views import Stage
-from ..views.explore import Frame, LiveRun, Summary
+from ..views.explore import Frame, LiveRun
 from ..views.stage import Draw
 from . import mechanics
 from .engine import ROUND_OFF, BatchedMode, time_and_state
@@ -253,16 +253,24 @@ class OwnModel(AbstractModel):
 
     def components_of(self, rows: Float[Array, "rows *cells"]) -> Float[Array, "components *cells"]:
         """States of the engine in the user's components."""
+
+        def of_one(tree: dict[str, Any], state: Array) -> Array:
+            return components_of(assembled(tree)[0].modes[0], state[: self.form.size])
+
+        return jnp.moveaxis(self.over_cells(of_one, rows.ndim - 1, jnp.moveaxis(rows, 0, -1)), -1, 0)
+
+    def over_cells(self, function: Callable[..., PyTree], axes: int, *arguments: Array) -> PyTree:
+        """Map a function of the trees of one run and of further arguments over cells. **Arguments:** `axes`: number of axes
+        of cells, which are the first axes of the arguments, and of the numbers that differ from cell to cell."""
         values = self.parameters.values
 
-        def of_one(state: Array, *numbers: Array) -> Array:
-            hybrid, _ = assembled(self.parameters.form.tree(numbers))
-            return components_of(hybrid.modes[0], state[: self.form.size])
+        def mapped(numbers: tuple[Array, ...], *arguments: Array) -> PyTree:
+            return function(self.parameters.form.tree(numbers), *arguments)
 
-        if rows.ndim == 1:
-            return of_one(rows, *values)
-        axes = tuple(0 if jnp.ndim(value) else None for value in values)
-        return jax.vmap(of_one, in_axes=(1, *axes), out_axes=1)(rows, *values)
+        for axis in reversed(range(axes)):
+            of_numbers = tuple(0 if jnp.ndim(value) > axis else None for value in values)
+            mapped = jax.vmap(mapped, (of_numbers, *[0] * len(arguments)))
+        return mapped(values, *arguments)
 
     def ended(self, outcome: Outcome | HybridOutcome, tolerance: object) -> Int[Array, " cells"]:
         return statuses(outcome.status, Status.STOPPED)
@@ -300,14 +308,10 @@ def _balance_of(
     """The quantities of `BALANCE` at some states. **Arguments:** `model`: with numbers that have the first axes of the times,
     or none."""
 
-    def of_one(t: Array, state: Array, *numbers: Array) -> tuple[Array, ...]:
-        tree = model.parameters.form.tree(numbers)
+    def of_one(tree: dict[str, Any], t: Array, state: Array) -> tuple[Array, ...]:
         return mechanics.energy_balance(tree["system"], tree["input"], t, *jnp.split(state, 2))
 
-    values, function = model.parameters.values, of_one
-    for level in reversed(range(times.ndim)):
-        function = jax.vmap(function, (0, 0, *(0 if jnp.ndim(value) > level else None for value in values)))
-    return function(times, states, *values)
+    return model.over_cells(of_one, times.ndim, times, states)
 
 
 _compiled_balance = eqx.filter_jit(_balance_of)
@@ -322,8 +326,7 @@ def _parts_of_cells(model: OwnModel) -> mechanics.Parts:
     """What the rules compare: the start, the functions of a mechanical first mode, and the least of its margins; for all
     cells."""
 
-    def of_one(*numbers: Array) -> mechanics.Parts:
-        tree = model.parameters.form.tree(numbers)
+    def of_one(tree: dict[str, Any]) -> mechanics.Parts:
         system = tree["system"]
         first = system.modes[system.first] if isinstance(system, Hybrid) else system
         y = state_of(tree["start"])
@@ -335,9 +338,7 @@ def _parts_of_cells(model: OwnModel) -> mechanics.Parts:
             parts.pop("frame", None)  # Modes of a `Hybrid` use Lagrange multipliers.
         return {"y": y} | parts | least
 
-    values = jax.lax.stop_gradient(model.parameters.values)
-    axes = tuple(0 if jnp.ndim(value) else None for value in values)
-    return of_one(*values) if set(axes) == {None} else jax.vmap(of_one, in_axes=axes)(*values)
+    return jax.lax.stop_gradient(model).over_cells(of_one, max(map(jnp.ndim, model.parameters.values)))
 
 
 _compiled_parts = eqx.filter_jit(_parts_of_cells)
@@ -472,6 +473,6 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
         frame,
         title=model.title,
         answer=("time of the event", "s") if model.has_event else (f"{names[0]} at the end", ""),
-        summaries=tuple(Summary(name, "", k) for k, name in enumerate(names[:2])),
+        summaries=tuple(range(len(names[:2]))),
     )
     return live, stage

@@ -3,6 +3,8 @@
 (async () => {
   const { facts, answer, motion, allowed } = window.live, { sliders, words } = facts, { layout } = motion;
   const [asks, moves] = [integrator(answer), integrator(motion)];
+  // The labels of the curves, and the factors that convert their values to the units in these.
+  const [{ shows: [{ curves }] }] = JSON.parse(document.getElementById("facts").textContent).stages;
   const box = document.getElementById("explore"), result = document.getElementById("result");
   const element = (kind, parent, properties = {}) => parent.appendChild(Object.assign(document.createElement(kind), properties));
   const initial = sliders.map((slider) => slider.value);
@@ -63,10 +65,11 @@
     element("strong", result, { textContent: Number.isFinite(found) ? `${digits(found)} ${facts.answer.unit}` : word });
     element("span", result, { className: "word", textContent: Number.isFinite(found) ? word : "\u00a0" });
     const list = element("dl", result), entry = (kind, ...texts) => element(kind, list).append(...texts);
-    for (const { label, unit, factor, curve } of facts.summaries) {
+    for (const curve of facts.summaries) {
+      const { label, factor } = curves[curve], [, name, unit = ""] = /^(.*?)(?: \[(.*)\])?$/.exec(label);
       const all = run.curves[curve].values.map((value) => factor * value), [begin, end] = [all[0], all[all.length - 1]];
       const drift = Math.max(...all.map((one) => Math.abs(one - begin))) / Math.abs(begin);
-      entry("dt", label);
+      entry("dt", name);
       if (drift < 1e-5) { entry("dd", `${digits(begin)} ${unit}`); entry("dt"); entry("dd", `constant to ${drift.toExponential(0)}`); continue; }
       const [from, to] = [`${digits(begin)} →`, `${digits(end)} ${unit}`].map((textContent) => Object.assign(document.createElement("span"), { textContent }));
       entry("dd", from, " ", to);
@@ -134,7 +137,7 @@
     if (event.key === "r" && !event.ctrlKey && !event.metaKey && !event.altKey) reset();
   });
   window.addEventListener("hashchange", () => set(fromAddress()));
-  Object.assign(live, { set, map, values: () => values, simulate, asks, moves, player: () => player });
+  Object.assign(live, { curves, set, map, values: () => values, simulate, asks, moves, player: () => player });
   set(fromAddress());
   if (window.views) {
     player = await window.views.ready;

@@ -587,15 +587,6 @@ class Slider(NamedTuple):
     factor: float = 1.0
 
 
-class Summary(NamedTuple):
-    """A curve of the `Show` whose values at the start and the end of the run are also shown as numbers."""
-
-    label: str
-    unit: str
-    curve: int
-    factor: float = 1.0
-
-
 class LiveRun(NamedTuple):
     """The contents of a page with sliders.
 
@@ -605,7 +596,8 @@ class LiveRun(NamedTuple):
       of the result.
     - `words`: the words of statuses to which the page gives another name.
     - `motion`: the simulator of the drawn run, with its `frame`.
-    - `summaries`: numbers shown beside the result.
+    - `summaries`: indices of the curves of the `Show` whose values at the start and the end of the run the page also shows as
+      numbers, beside the result.
     """
 
     title: str
@@ -616,14 +608,14 @@ class LiveRun(NamedTuple):
     unit: str
     words: Mapping[int, str]
     motion: Simulator
-    summaries: tuple[Summary, ...]
+    summaries: tuple[int, ...]
 
 
 def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "", unit: Unit = None) -> Page:
     """The page of a run with sliders.
 
     **Arguments:** `stage`: a stage with one run, for its arena, meshes and names; `speed`, `below`: as for `page`; `unit`: that
-    of curves, arrows, sliders and summaries, as for `in_unit`.
+    of curves, arrows and sliders, as for `in_unit`.
 
     **Raises:** `ModuleNotFoundError` if the library for views is not installed; `ValueError` for equations that cannot be
     written in JavaScript.
@@ -631,9 +623,8 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "", 
     # The title and the warnings describe one run, but the sliders change the run.
     stage_of_live = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
     sliders = tuple(slider._replace(**converted(slider.unit, unit)) for slider in live.sliders)
-    summaries = tuple(summary._replace(**converted(summary.unit, unit)) for summary in live.summaries)
-    live = live._replace(sliders=sliders, summaries=summaries)
-    scripts = [script(text) for text in (programs(live), template("map.js"), template("explore.js"))]
+    texts = (programs(live._replace(sliders=sliders)), template("map.js"), template("explore.js"))
+    scripts = [script(text) for text in texts]
     section = f'<section id="below">{below}</section>'
     return page(curves_in([stage_of_live], unit), live.title, speed, template("explore.html"), section, scripts=scripts)
 
@@ -645,7 +636,7 @@ def programs(live: LiveRun) -> str:
         "sliders": [slider._asdict() for slider in live.sliders],
         "words": {int(status): status.word for status in Status} | dict(live.words),
         "answer": {"label": live.label, "unit": live.unit},
-        "summaries": [summary._asdict() for summary in live.summaries],
+        "summaries": live.summaries,
     }
     parts = {
         "facts": json.dumps(facts),

@@ -31,7 +31,7 @@ from ..terminal import status_line
 from ..text import Unit, require_unit, shown, unit_of
 from ..validation import replacing, require, require_file, require_increasing, require_package
 from .plot import legend_above, new_figure
-from .stage import Arrow, Body, Curve, Draw, Marks, Mesh, Show, Stage, Trace, css, curves_in, finite
+from .stage import Arrow, Draw, Marks, Stage, Trace, css, curves_in, finite
 
 # Only for type checkers: matplotlib is optional.
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def page(
             "speed": speed,
             "speeds": [(f"{factor:g} x real time" if factor != 1.0 else "real time", factor) for factor in SPEEDS],
             "autoplay": autoplay,
-            "stages": [_stage(stage, numbers) for stage in stages],
+            "stages": numbers.described(stages),
         }
         floats, whole = map(np.concatenate, numbers.parts.values())
         data = {
@@ -164,45 +164,29 @@ class _Numbers:
         self.parts: dict[str, list[np.ndarray]] = {"floats": [], "whole": []}
         self.places: dict[tuple[str, bytes], tuple[int, int]] = {}
 
-    def add(self, values: np.ndarray, kind: str = "floats") -> dict[str, tuple[int, int]]:
-        """Add an array of floats, or of whole numbers, and return what identifies the array."""
-        flat = np.diff(values.ravel(), prepend=0) if kind == "whole" else values.ravel()
-        flat = np.ascontiguousarray(flat, dtype="<i4" if kind == "whole" else "<f4")
-        key = kind, flat.tobytes()
+    def add(self, values: np.ndarray) -> dict[str, tuple[int, int]]:
+        """Add an array, and return what identifies the array."""
+        is_whole = values.dtype.kind == "i"
+        flat = np.diff(values.ravel(), prepend=0) if is_whole else values.ravel()
+        flat = np.ascontiguousarray(flat, dtype="<i4" if is_whole else "<f4")
+        key = kind, _ = "whole" if is_whole else "floats", flat.tobytes()
         if key not in self.places:
             self.places[key] = (sum(map(len, self.parts[kind])), flat.size)
             self.parts[kind].append(flat)
         return {kind: self.places[key]}
 
-    def described(self, part: object) -> Any:
-        """A part of a stage for the script: a named tuple by its fields, and arrays by their places."""
-        if isinstance(part, Mesh):
-            vertices, triangles = self.add(part.vertices), self.add(part.triangles, "whole")
-            return {"vertices": vertices, "triangles": triangles, "colour": css(part.colour)}
+    def described(self, part: Any) -> Any:
+        """Stages or their parts for the script: named tuples by their fields, colours in CSS, and arrays by their places."""
         if isinstance(part, Trace):
             part = part._replace(points=finite(part.points))
         elif isinstance(part, Arrow):
             part = part._replace(start=finite(part.start), vector=finite(part.vector))
-        if isinstance(part, Show | Body | Trace | Arrow | Curve):
+        if hasattr(part, "_fields"):
             fields = {name: self.described(value) for name, value in part._asdict().items()}
-            return fields | ({"colour": css(part.colour)} if isinstance(part, Show | Trace | Arrow) else {})
-        if isinstance(part, tuple):
+            return fields | ({"colour": css(part.colour)} if "colour" in fields else {})
+        if isinstance(part, list | tuple):
             return [self.described(item) for item in part]
         return part if isinstance(part, str | float | int | None) else self.add(np.asarray(part))
-
-
-def _stage(stage: Stage, numbers: _Numbers) -> dict[str, object]:
-    """The data of a stage for the script."""
-    lines = [numbers.add(line) for line in stage.arena.lines]
-    return {
-        "title": stage.title,
-        "spacing": stage.arena.spacing,
-        "follows": stage.follows,
-        "rise": stage.rise,
-        "arena": numbers.described(stage.arena.mesh)
-        | {"lines": lines, "axes": stage.arena.axes, "normal": stage.arena.normal.tolist()},
-        "runs": numbers.described(stage.shows),
-    }
 
 
 # What a command line writes and prints at the end.
@@ -458,10 +442,10 @@ def require_labels(label: Label, runs: list[Any]) -> list[str]:
     return list(labels)
 
 
-def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> "Figure":
+def draw_curves(stages: list[Stage], names: Sequence[str]) -> "Figure":
     """Draw the curves of all runs on stages over time, with a panel for each label.
 
-    **Arguments:** `names`: names of the runs for the legend, by default those on the page.
+    **Arguments:** `names`: names of the runs for the legend.
 
     **Returns:** a matplotlib figure.
     """
@@ -469,7 +453,6 @@ def draw_curves(stages: list[Stage], names: Sequence[str] = ()) -> "Figure":
     labels = list(dict.fromkeys(curve.label for show in shows for curve in show.curves))
     figure = new_figure(7.0, 1.3 + 1.5 * len(labels))
     panels = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
-    names = names or [show.name if len(shows) > 1 else "" for show in shows]
     for label, panel in zip(labels, panels, strict=True):
         for show, name in zip(shows, names, strict=True):
             style = {"color": css(show.colour), "linewidth": 1.0}

@@ -49,8 +49,8 @@ window.views = window.views || {};
       Object.assign(this, { facts, root, listeners: [], now: 0, running: false, before: null, turn: false, filming: false });
       const { element } = views, boxes = element("div", root, { id: "stages" });
       // The legend of the curves tells runs of equal names on several stages apart.
-      const names = stages.flatMap((fact) => fact.runs.map((run) => run.name)), once = (name) => names.indexOf(name) === names.lastIndexOf(name);
-      for (const { title, runs } of stages) for (const run of runs) run.legend = once(run.name) ? run.name : `${title}, ${run.name}`;
+      const names = stages.flatMap((fact) => fact.shows.map((run) => run.name)), once = (name) => names.indexOf(name) === names.lastIndexOf(name);
+      for (const { title, shows } of stages) for (const run of shows) run.legend = once(run.name) ? run.name : `${title}, ${run.name}`;
       this.stages = stages.map((fact) => this.figure(element("figure", boxes), fact, THREE));
       this.bar(element("div", root, { id: "controls" }));
       const strips = element("div", root, { id: "strips" });
@@ -63,7 +63,7 @@ window.views = window.views || {};
       for (const stage of this.stages) stage.firstSpan = stage.span;
       this.seek(0);
     }
-    runs() { return this.stages.flatMap((stage) => stage.fact.runs); }
+    runs() { return this.stages.flatMap((stage) => stage.fact.shows); }
     measure() {
       this.length = Math.max(...this.runs().map((run) => run.times[run.times.length - 1]));
       this.slider.max = this.length;
@@ -82,10 +82,10 @@ window.views = window.views || {};
       toggle(follow, stage.follows); toggle(orbit, false);
       // Of a single stage, the heading of the page may say it already.
       if (fact.title && fact.title !== document.title) element("b", caption, { textContent: fact.title });
-      const notes = new Set(fact.runs.map((run) => run.note).filter(Boolean));
+      const notes = new Set(fact.shows.map((run) => run.note).filter(Boolean));
       for (const note of notes) element("span", caption, { className: "warning", textContent: note });
-      const names = fact.runs.length > 1 ? fact.runs.map((run) => [run.name, run.colour]) : [];
-      for (const [words, colour] of [...(fact.spacing ? [[fact.spacing]] : []), ...names]) {
+      const names = fact.shows.length > 1 ? fact.shows.map((run) => [run.name, run.colour]) : [];
+      for (const [words, colour] of [...(fact.arena.spacing ? [[fact.arena.spacing]] : []), ...names]) {
         const key = element("span", caption, { className: "key" });
         if (colour) element("i", key).style.background = colour;
         key.append(words);
@@ -99,8 +99,8 @@ window.views = window.views || {};
         return element("span", one);
       };
       // Traces of several runs have the colours of the runs, which the caption explains beside the names of the runs.
-      fact.runs[0].traces.forEach((trace, k) => chip("traces", fact.runs.length > 1 ? { ...trace, colour: "#6b7280" } : trace, k));
-      stage.values = fact.runs[0].arrows.map((arrow, k) => (arrow.unit ? chip("arrows", arrow, k) : null));
+      fact.shows[0].traces.forEach((trace, k) => chip("traces", fact.shows.length > 1 ? { ...trace, colour: "#6b7280" } : trace, k));
+      stage.values = fact.shows[0].arrows.map((arrow, k) => (arrow.unit ? chip("arrows", arrow, k) : null));
       return stage;
     }
 
@@ -213,7 +213,7 @@ window.views = window.views || {};
 
     // Replace the displayed data of a run by arrays in the form that Python writes; omitted arrays do not change.
     setRun(s, r, run) {
-      const stage = this.stages[s], fact = stage.fact.runs[r];
+      const stage = this.stages[s], fact = stage.fact.shows[r];
       const merged = (name) => run[name] && run[name].forEach((one, k) => Object.assign(fact[name][k], one));
       if (run.times) fact.times = run.times;
       if (run.normal) fact.normal = run.normal;
@@ -225,7 +225,7 @@ window.views = window.views || {};
       this.seek(this.now);
     }
     show(stage, r, time) {
-      const run = stage.fact.runs[r], at = views.place(run.times, time), count = at[0] + at[1];
+      const run = stage.fact.shows[r], at = views.place(run.times, time), count = at[0] + at[1];
       stage.setNormal(r, point(run.normal, at));
       run.bodies.forEach((body, k) => stage.setPose(r, k, point(body.position, at), orientation(body.orientation, at)));
       run.traces.forEach((trace, k) => stage.setTrace(r, k, Math.round(count), trace.about && point(trace.about, at)));
@@ -235,7 +235,7 @@ window.views = window.views || {};
     seek(wanted) {
       this.now = Math.min(Math.max(wanted, 0), this.length);
       for (const stage of this.stages) {
-        stage.look(stage.fact.runs.map((_, r) => this.show(stage, r, this.now)), stage.follows);
+        stage.look(stage.fact.shows.map((_, r) => this.show(stage, r, this.now)), stage.follows);
         stage.render();
         stage.values.forEach((value, k) => {
           const { shownSize, unit } = stage.runs[0].arrows[k];

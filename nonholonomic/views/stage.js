@@ -51,7 +51,7 @@ window.views = window.views || {};
   class Stage {
     // `fact`: the data of a stage from Python, with unpacked arrays; `box`: the element that the stage fills.
     constructor(THREE, box, fact) {
-      Object.assign(this, { THREE, box, fact, size: max(...fact.runs.map((run) => run.size)), focus: null, span: 1 });
+      Object.assign(this, { THREE, box, fact, size: max(...fact.shows.map((run) => run.size)), focus: null, span: 1 });
       this.renderer = this.drawer();
       this.renderer.setPixelRatio(min(window.devicePixelRatio || 1, 2));
       this.renderer.shadowMap.enabled = true;
@@ -66,7 +66,7 @@ window.views = window.views || {};
       this.controls.addEventListener("change", () => this.render());
       this.light();
       this.arena(fact.arena);
-      this.runs = fact.runs.map((run) => this.run(run));
+      this.runs = fact.shows.map((run) => this.run(run));
       this.fit();
       fact.camera = this.placed();
       this.reset();
@@ -109,7 +109,7 @@ window.views = window.views || {};
       return geometry;
     }
     // Draw only the front of the surface, so that a wall between camera and body hides nothing.
-    arena({ vertices, triangles, colour, lines, axes }) {
+    arena({ mesh: { vertices, triangles, colour }, lines, axes }) {
       const { THREE } = this, geometry = this.geometry({ positions: vertices });
       geometry.setIndex(new THREE.BufferAttribute(triangles, 1));
       geometry.computeVertexNormals();
@@ -153,9 +153,9 @@ window.views = window.views || {};
     run(fact) {
       const bodies = fact.bodies.map((body) => this.body(body.meshes));
       // Traces of several runs have the colours of the runs.
-      const traces = fact.traces.map((trace) => this.trace(this.fact.runs.length > 1 ? { ...trace, colour: fact.colour } : trace));
+      const traces = fact.traces.map((trace) => this.trace(this.fact.shows.length > 1 ? { ...trace, colour: fact.colour } : trace));
       const arrows = fact.arrows.map((arrow) => this.arrow(arrow));
-      const name = this.fact.runs.length > 1 ? element("span", this.labels, { className: "name", textContent: fact.name }) : null;
+      const name = this.fact.shows.length > 1 ? element("span", this.labels, { className: "name", textContent: fact.name }) : null;
       if (name) name.style.background = fact.colour;
       return { bodies, traces, arrows, name, normal: [0, 0, 1] };
     }
@@ -262,14 +262,14 @@ window.views = window.views || {};
     // The first place and target of the camera. It follows bodies that are small compared with their paths. Otherwise a level
     // rectangle with axes, and all that is drawn above it, fill the picture, but for the room of the labels.
     placed() {
-      const { THREE: { Box3, Vector3 }, fact: { arena, runs, follows, rise }, size } = this, { fov, aspect } = this.camera;
+      const { THREE: { Box3, Vector3 }, fact: { arena, shows, follows, rise }, size } = this, { fov, aspect } = this.camera;
       const points = (values) => {
         const list = [];
         for (let k = 0; k + 2 < values.length; k += 3) if (Number.isFinite(values[k] + values[k + 1] + values[k + 2])) list.push(new Vector3().fromArray(values, k));
         return list;
       };
       const centred = (list) => { const middle = new Box3().setFromPoints(list).getCenter(new Vector3()); return [middle, list.reduce((far, p) => max(far, p.distanceTo(middle)), 0)]; };
-      const paths = runs.map(({ bodies }) => points(bodies[0].position)), normal = new Vector3(...arena.normal), aside = new Vector3(0.35, -1, 0);
+      const paths = shows.map(({ bodies }) => points(bodies[0].position)), normal = new Vector3(...arena.normal), aside = new Vector3(0.35, -1, 0);
       let [middle, reach] = centred(paths.flat());
       this.fact.follow = follows || reach > 4 * size;
       if (this.fact.follow) {
@@ -280,8 +280,8 @@ window.views = window.views || {};
       let distance = (1.05 * (reach + 1.6 * size)) / Math.sin((ANGLE * Math.PI) / 360);
       if (arena.axes.length && !this.fact.follow) {
         const farthest = (meshes) => max(0, ...meshes.map(({ vertices }) => points(vertices).reduce((far, p) => max(far, p.length()), 0)));
-        const drawn = points(arena.vertices);
-        for (const { bodies, arrows } of runs) {
+        const drawn = points(arena.mesh.vertices);
+        for (const { bodies, arrows } of shows) {
           for (const { position, meshes } of bodies) { const height = farthest(meshes); for (const p of points(position)) drawn.push(p.setZ(p.z + height)); }
           for (const { start, vector } of arrows) drawn.push(...points(start.map((x, k) => x + vector[k])));
         }

@@ -40,7 +40,6 @@ class Mesh(NamedTuple):
 class Body(NamedTuple):
     """A rigid body: position of its origin, rotation as a quaternion (x, y, z, w) for each time, and meshes."""
 
-    name: str
     position: Points
     orientation: Float[np.ndarray, "times 4"]
     meshes: tuple[Mesh, ...]
@@ -472,11 +471,8 @@ def own(surface: AbstractSurface, position: np.ndarray) -> tuple:
 
 def fixed(surface: AbstractSurface, vector: tuple) -> np.ndarray:
     """A vector in the surface's axes, converted to the fixed frame, (..., 3)."""
-    example = next(part for part in vector if part is not None)
-    components = tuple(
-        np.zeros_like(np.asarray(example, dtype=float)) if part is None else np.asarray(part) for part in vector
-    )
-    return np.stack(np.broadcast_arrays(*(np.asarray(part) for part in surface.in_fixed_frame(components))), axis=-1)
+    components = np.broadcast_arrays(*(0.0 if part is None else np.asarray(part) for part in vector))
+    return np.stack(surface.in_fixed_frame(components), axis=-1)
 
 
 def nice(step: float, is_angle: bool) -> tuple[float, str]:

@@ -549,19 +549,19 @@ def planned_stage(plan: Plan) -> Stage:
         columns = np.stack([np.broadcast_to(top.mean(axis=0), top.shape), top, foot], axis=1)
         closed = np.concatenate([columns, columns[:1]])
         blocks.append(Mesh(closed.reshape(-1, 3), of_grid(len(closed), 3), STONE))
-    still = [("candidates", ribbons), *([("obstacles", blocks)] if blocks else [])]
+    still = [ribbons, *([blocks] if blocks else [])]
     ends = goal_corners(problem, 2.0 * RAISED * length)
     pairs = (ends[:2], ends[2:]) if problem.goal.heading is None else (ends, np.roll(ends, -1, axis=0))
     arms = [bar(tuple(a), tuple(b), 2.0 * THIN * length, GREEN) for a, b in zip(*pairs, strict=True)]
-    still.append(("goal", arms))
+    still.append(arms)
     place, turn = np.zeros((count, 3)), np.tile(UNTURNED, (count, 1))
-    bodies = tuple(Body(name, place, turn, tuple(meshes)) for name, meshes in still)
+    bodies = tuple(Body(place, turn, tuple(meshes)) for meshes in still)
     vehicle = show.bodies[0]
     # The frame's origin is the middle of the rear axle, above the ground.
     low = np.asarray(problem.footprint.corners(np.array([0.0, 0.0, -0.17 * length]), *np.eye(3)[:2]))
     edges = zip(map(tuple, low), map(tuple, np.roll(low, -1, axis=0)), strict=True)
     frame = tuple(bar(a, b, 1.5 * THIN * length, DARK) for a, b in edges)
-    footprint = Body("footprint", vehicle.position, vehicle.orientation, frame)
+    footprint = Body(vehicle.position, vehicle.orientation, frame)
     name = f"plan of {plan.t1:.3g} s"
     title = f"{name}: {'reaches the goal' if plan.reached else 'does not reach the goal'}"
     shows = (show._replace(name=name, bodies=(*show.bodies, footprint, *bodies)),)

@@ -19,7 +19,7 @@ from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, pag
 from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit
 from nonholonomic.validation import explaining
-from nonholonomic.views.explore import Frame, LiveRun, Summary
+from nonholonomic.views.explore import Frame, LiveRun
 from nonholonomic.views.stage import Kind
 
 from ..model.dynamics import State
@@ -48,9 +48,8 @@ DRAWN_GRIP = 3.0
 GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 
-#: The drawn parts of a vehicle, its traces with their colours and widths [wheelbases], and the forces with their colours and
-#: longest arrows [wheelbases].
-PARTS = ("frame", "left wheel", "right wheel", "front wheel")
+#: The traces of a vehicle with their colours and widths [wheelbases], and the forces with their colours and longest arrows
+#: [wheelbases].
 TRACES = (("path of the rear axle", GREEN, 0.05), ("path of the front wheel", BLUE, 0.025))
 FORCES = (("normal force, rear", VIOLET, None), ("normal force, front", VIOLET, None))
 FORCES += (("side force, rear", GOLD, 2.0), ("side force, front", GOLD, 2.0))
@@ -90,7 +89,7 @@ def normals(scene: Scene, position: Kind) -> Kind:
 
 
 def frame_of(scene: Scene, normal: Kind, values: dict[str, Kind], angles: Sequence[Kind] | Kind) -> Frame[Kind]:
-    """What is drawn of a ride: `PARTS`, `TRACES`, `FORCES` and `CURVES`.
+    """What is drawn of a ride: frame, left, right and front wheel; `TRACES`, `FORCES` and `CURVES`.
 
     **Arguments:** `normal`: that of the ground; `values`: the quantities `SHOWN` (*times, ...); `angles` [rad] by which left,
     right and front wheel have rolled.
@@ -150,7 +149,7 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
         times,
         normal,
         SIZE * length,
-        tuple(views.Body(part, *pose, mesh) for part, pose, mesh in zip(PARTS, frame.bodies, meshes, strict=True)),
+        tuple(views.Body(*pose, mesh) for pose, mesh in zip(frame.bodies, meshes, strict=True)),
         tuple(
             views.Trace(label, points, colour, share * length)
             for (label, colour, share), (points, _) in zip(TRACES, frame.traces, strict=True)
@@ -288,7 +287,7 @@ def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[
         frame,
         title=f"Stroller on a {type(model.scene.surface).__name__.lower()}",
         answer=("distance from the start", "m"),
-        summaries=(Summary("speed", "m/s", 0), Summary("energy", "J", 2)),
+        summaries=(0, 2),
         motion=rolling,
     )
     rides = runs_at_ends(model, knobs, t1)

@@ -97,7 +97,7 @@ def test_the_page_opens_and_rides_anew(browser, tmp_path):
     wait(browser, "return !!(window.live && live.ready)")
     value_before = browser.execute_script("return live.outcome.value")
     # A distance is no time to mark.
-    assert browser.execute_script("return player.stages[0].fact.runs[0].marks") == []
+    assert browser.execute_script("return player.stages[0].fact.shows[0].marks") == []
     browser.execute_script("live.set([1.0, 0.0])")
     wait(browser, f"return live.outcome.value < {value_before!r}")
     assert complaints(browser) == []

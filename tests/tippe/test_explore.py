@@ -234,7 +234,7 @@ def test_a_slider_simulates_anew(browser, page, rutstam_scene):
 def test_a_page_says_that_a_top_fell_back(browser, page):
     """A run whose angle is small in the end."""
     reset(browser)
-    texts = "return [document.querySelector('#result .word').textContent, player.stages[0].fact.runs[0].marks[0][1]]"
+    texts = "return [document.querySelector('#result .word').textContent, player.stages[0].fact.shows[0].marks[0][1]]"
     word, mark = browser.execute_script(
         "const { trajectory } = live.moves; live.moves.trajectory = (...given) => { const run = trajectory(...given);"
         " return { ...run, read: (times) => run.read(times).map((row) => {"
@@ -259,9 +259,9 @@ def test_a_page_that_was_hidden_keeps_its_many_frames(browser, page):
         " held.forEach((act) => act()); };"
         "live.set([0.2, 155])"
     )
-    wait(browser, "return player.stages[0].fact.runs[0].times.length > 500 && live.values()[0] === 0.2")
+    wait(browser, "return player.stages[0].fact.shows[0].times.length > 500 && live.values()[0] === 0.2")
     time.sleep(0.3)
-    assert browser.execute_script("shown(); return player.stages[0].fact.runs[0].times.length") > 500
+    assert browser.execute_script("shown(); return player.stages[0].fact.shows[0].times.length") > 500
 
 
 def test_the_address_holds_the_sliders(browser, page):
@@ -407,7 +407,7 @@ def test_keys_play_and_reset(browser, page):
     assert browser.execute_script("return player.time()") == 0.5
     # The page marks when the top turned over.
     wait(browser, "return live.outcome.value > 0")
-    marks = browser.execute_script("return player.stages[0].fact.runs[0].marks")
+    marks = browser.execute_script("return player.stages[0].fact.shows[0].marks")
     value = browser.execute_script("return live.outcome.value")
     assert [[time, words] for time, words in marks] == [[value, f"turned over at {value:.3g} s"]]
 
@@ -416,12 +416,12 @@ def test_labels_are_text(browser, page):
     """A quantity may be called what HTML would read as a mark."""
     reset(browser)
     texts = browser.execute_script(
-        "const { answer, summaries } = live.facts, kept = [answer.label, summaries[0].label];"
-        "answer.label = 'time <b>t</b>'; summaries[0].label = '<i>q</i>';"
+        "const { answer, summaries } = live.facts, curve = live.curves[summaries[0]], kept = [answer.label, curve.label];"
+        "answer.label = 'time <b>t</b>'; curve.label = '<i>q</i> [J]';"
         "live.simulate(300); live.map.update(live.values(), true);"
         "const texts = ['result', 'legend'].map((id) => document.getElementById(id));"
         "const marks = texts.map((one) => one.querySelectorAll('b').length), words = texts.map((one) => one.textContent);"
-        "[answer.label, summaries[0].label] = kept; live.simulate(300); return [marks, words]"
+        "[answer.label, curve.label] = kept; live.simulate(300); return [marks, words]"
     )
     assert texts[0] == [0, 0]
     assert "time <b>t</b>" in texts[1][0]

@@ -63,7 +63,7 @@ def rolling(surface=None) -> Stage:
     rotation = np.moveaxis(np.array(rows), -1, 0)
     position = np.stack([radius * times, zero, zero + radius], axis=-1)
     foot = position * [1.0, 1.0, 0.0]
-    body = Body("ball", position, quaternion(rotation), ball(radius, (0xC8412B, 0xF4E9D2)))
+    body = Body(position, quaternion(rotation), ball(radius, (0xC8412B, 0xF4E9D2)))
     np.testing.assert_allclose(Rotation.from_quat(body.orientation).as_matrix(), rotation, atol=1e-14)
     show = Show(
         "a ball",
@@ -207,7 +207,7 @@ def test_what_cannot_be_filmed_is_refused(options, message, tmp_path):
 
 def test_curves_are_drawn_and_what_is_constant_is_flat():
     stage = rolling()
-    x, z = draw_curves([stage]).axes
+    x, z = draw_curves([stage], [""]).axes
     np.testing.assert_array_equal(x.lines[0].get_ydata(), stage.shows[0].curves[0].values)
     assert x.get_ylabel() == "x [m]"
     low, high = z.get_ylim()
@@ -245,8 +245,8 @@ def test_a_page_holds_its_numbers_in_single_precision():
     planes, steps = (zlib.decompress(base64.b64decode(data[name])) for name in ("floats", "whole"))
     floats = np.frombuffer(planes, np.uint8).reshape(4, -1).T.copy().view("<f4").ravel()
     (show,) = stage.shows
-    fact = facts["stages"][0]["runs"][0]
-    assert fact == facts["stages"][1]["runs"][0]
+    fact = facts["stages"][0]["shows"][0]
+    assert fact == facts["stages"][1]["shows"][0]
     for place, values in (
         (fact["times"], show.times),
         (fact["bodies"][0]["orientation"], show.bodies[0].orientation),
@@ -254,7 +254,7 @@ def test_a_page_holds_its_numbers_in_single_precision():
     ):
         start, length = place["floats"]
         np.testing.assert_allclose(floats[start : start + length], values.ravel(), rtol=1e-6, atol=1e-12)
-    start, length = facts["stages"][0]["arena"]["triangles"]["whole"]
+    start, length = facts["stages"][0]["arena"]["mesh"]["triangles"]["whole"]
     triangles = np.cumsum(np.frombuffer(steps, "<i4")[start : start + length])
     np.testing.assert_array_equal(triangles, stage.arena.mesh.triangles.ravel())
     # The page of two balls, with three.js.

@@ -233,7 +233,7 @@ def test_a_run_is_replaced_while_the_page_is_open(browser, top):
     """As a live simulation does it: other times, poses and curves in the same stage."""
     value_before = browser.execute_script("return player.duration()")
     browser.execute_script(
-        "const run = player.stages[0].fact.runs[0];"
+        "const run = player.stages[0].fact.shows[0];"
         "window.kept = { times: run.times, bodies: run.bodies.map((one) => ({ ...one })) };"
         "player.setRun(0, 0, { times: new Float64Array([0, 2]), bodies: [{ position: new Float32Array([0, 0, 0, 1, 2, 3]),"
         "turning: new Float32Array([0, 0, 0, 1, 0, 0, 0, 1]) }] })"
@@ -410,7 +410,7 @@ def test_the_plane_of_an_own_system_fills_the_picture(browser, tmp_path):
             wait(browser, "return !!window.player")
             corners, labels = browser.execute_script(
                 "const [{ camera, fact, THREE, labels, box }] = player.stages, inside = box.getBoundingClientRect();"
-                "const { x, y, width, height } = inside, { vertices } = fact.arena;"
+                "const { x, y, width, height } = inside, { vertices } = fact.arena.mesh;"
                 "const corners = [0, 3, 6, 9].map((k) => new THREE.Vector3().fromArray(vertices, k).project(camera));"
                 "return [corners.map((at) => [at.x, at.y]), [...labels.children].map((one) => one.getBoundingClientRect())"
                 ".map((one) => [one.left - x, one.right - x, one.top - y, one.bottom - y])"
