@@ -202,7 +202,7 @@ MEMBERS = {
     "nonholonomic.Torus": "from_middle",
     "nonholonomic.AbstractSurface": "axes sides coordinates up normal normal_rate elevation gaussian_curvature nearest "
     "distance place_at charted in_fixed_frame in_own_axes",
-    "tippe.AbstractFriction": "set_valued uses_spin isotropic per_normal_force",
+    "tippe.AbstractFriction": "set_valued isotropic per_normal_force",
     "stroller.AbstractFriction": "dissipates drag",
     "tippe.Trajectory": f"at {RUN} {TOP} contact normal_spin reaction grip",
     "tippe.HybridTrajectory": f"at {RUN} {TOP}",

@@ -24,8 +24,7 @@ class Slip(NamedTuple):
     """The motion of the body at the contact, in the moving frame (t1, t2, n).
 
     - `x`, `y`: velocity of the material contact point along the arena [m/s].
-    - `turning`: angular velocity of the body [rad/s]; its component along n, the drilling, is `None` unless the law
-      `uses_spin`.
+    - `turning`: angular velocity of the body [rad/s]; its component along n is the drilling.
     """
 
     x: Float[Array, "..."]
@@ -104,9 +103,6 @@ class AbstractFriction(Bounded):
 
     #: Whether friction on a contact at rest takes the value that keeps the contact at rest, within limits.
     set_valued: ClassVar[bool] = False
-
-    #: Whether the law depends on the body's angular velocity about the normal.
-    uses_spin: ClassVar[bool] = False
 
     #: Whether the law is the same in all directions along the arena; tables on the level plane are then faster and more
     #: accurate (`Scene.turning_dynamics`). If this is `True` for a law that is not isotropic, tables are wrong.
@@ -261,7 +257,6 @@ class Contensou(AbstractFriction):
 
     units: ClassVar[dict[str, str]] = {"mu": "1", "contact_radius": "m", "slip_speed": "m s-1"}
     advice: ClassVar[dict[str, str]] = ADVICE
-    uses_spin: ClassVar[bool] = True
     isotropic: ClassVar[bool] = True
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number, metadata=FRICTION)
@@ -316,10 +311,6 @@ class Rolling(AbstractFriction):
     @property
     def units(self) -> dict[str, str]:
         return {"resistance": "m", "turning_speed": "rad s-1"} | self.sliding.units
-
-    @property
-    def uses_spin(self) -> bool:
-        return self.sliding.uses_spin
 
     @property
     def isotropic(self) -> bool:
@@ -410,10 +401,10 @@ def drive(law: AbstractFriction) -> str | None:
         grid.ravel() for grid in np.meshgrid(np.arange(8) * math.pi / 4.0, SPEEDS, TURNINGS, indexing="ij")
     )
     x, y = speed * np.cos(angle), speed * np.sin(angle)
-    zero, drilling = jnp.zeros(turning.shape), jnp.asarray(turning) if law.uses_spin else None
     try:
         with jax.ensure_compile_time_eval():
-            power = np.asarray(_power(law, Slip(jnp.asarray(x), jnp.asarray(y), (zero, zero, drilling))))
+            zero = jnp.zeros(turning.shape)
+            power = np.asarray(_power(law, Slip(jnp.asarray(x), jnp.asarray(y), (zero, zero, jnp.asarray(turning)))))
     except jax.errors.JAXTypeError as error:
         raise ValueError(f"friction = {one_line(law)}: per_normal_force {UNTRACEABLE}") from error
     except NoLoad:
@@ -427,7 +418,7 @@ def drive(law: AbstractFriction) -> str | None:
     if power.shape != x.shape or not np.any(power > 1e-12):
         return None
     index = int(np.nanargmax(power / speed))
-    drills = f" and a turning of {turning[index]:g} rad/s" if law.uses_spin and turning[index] else ""
+    drills = f" and a turning of {turning[index]:g} rad/s" if turning[index] else ""
     return (
         f"friction = {one_line(law)} drives the top: at a slip of ({x[index]:.3g}, {y[index]:.3g}) m/s{drills} its power is "
         f"{power[index]:.3g} W per newton of normal force, but the power of friction is never positive. Is a sign wrong? A run "

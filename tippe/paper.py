@@ -217,11 +217,6 @@ def rows_of(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[tup
     return list(zip(*columns, strict=True))
 
 
-def report(options: argparse.Namespace, by_arena: dict[str, Table]) -> str:
-    """The tables side by side, as text."""
-    return "\n".join([*described(options), "", *aligned(rows_of(options, by_arena))])
-
-
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     """The rows of a table as lines of text, with columns of equal width."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -303,7 +298,7 @@ def write(options: argparse.Namespace) -> views.Outputs:
     """Compute and write the tables, the picture if matplotlib is installed, and the page: two moving tops if three.js is
     installed, the tables, and the picture."""
     by_arena = tables(options)
-    print(report(options, by_arena))
+    print("\n".join([*described(options), "", *aligned(rows_of(options, by_arena))]))
     with status_line("drawing"):
         files = [options.out / f"{arena}.h5" for arena in by_arena]
         sections = "<h2>Inversion times</h2>" + views.table_as_html(list(map(list, rows_of(options, by_arena))), 2)

@@ -419,7 +419,7 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
 def _standing_matrix(scene: Scene, spin: Float[Array, ""], inverted: bool) -> Float[Array, "k k"]:
     state = standing_state(scene, spin, inverted)
     # The place components that matter near the arena's lowest point.
-    places = max(len(scene.frame.place_scales(1.0)) - 1, 0)
+    places = max(len(scene.frame.lengths) - 1, 0)
     if isinstance(scene.frame, CarriedFrame):
         # The foot (x, y, z), whose z is along n, and the first tangent, which is only the frame's choice of axes.
         places = 1 if isinstance(scene.surface, Torus) else 2

@@ -139,10 +139,6 @@ class AbstractFrame(eqx.Module):
         """Components of the upward vertical in the frame."""
         return self.frame_motion(place, (0.0, 0.0)).vertical
 
-    def place_scales(self, size: Component) -> Place:
-        """Magnitudes of the place's components. **Arguments:** `size`: size of the body [m]."""
-        return tuple(size if is_length else 1.0 for is_length in self.lengths)
-
 
 class PlaneFrame(AbstractFrame):
     """A plane: the frame does not turn. A level plane has no place; the place on a tilted one is x [m], along the

@@ -597,14 +597,11 @@ class Torus(AbstractGradientSurface):
             self.tube, "tube", below=self.ring, why="the radius of the ring: otherwise the tube would cut itself"
         )
 
-    def from_middle(self, position: Vector) -> Vector:
-        """The vector [m] to a position from the nearest point of the circle along the middle of the tube."""
+    def gradient(self, position: Vector) -> Vector:
+        # The vector [m] to the position from the nearest point of the circle along the middle of the tube.
         x, y, z = position
         part = 1.0 - self.ring / jnp.sqrt(x * x + y * y)
         return (part * x, part * y, z)
-
-    def gradient(self, position: Vector) -> Vector:
-        return self.from_middle(position)
 
     def gradient_rate(self, position: Vector, velocity: Vector) -> Vector:
         x, y, _ = position
@@ -625,7 +622,7 @@ class Torus(AbstractGradientSurface):
         return difference(position, scale(self.distance(position), self.normal(position)))
 
     def distance(self, position: Vector) -> Component:
-        spoke = self.from_middle(position)
+        spoke = self.gradient(position)
         return jnp.sqrt(dot(spoke, spoke)) - self.tube
 
     def place_at(self, position: Vector) -> Place:

@@ -13,7 +13,7 @@ from rigid_reference import Rattleback
 from scipy.linalg import expm
 
 import tippe
-from tippe.model.scene import generic_direction
+from tippe.runs.model import TopModel
 
 THEORY = Oscillations.of_ellipsoid(1.0, SHAPE, 0.01, INERTIA)
 
@@ -101,7 +101,7 @@ def test_nearby_rattlebacks_part_within_the_states_of_a_rolling_body():
         e, x = state[2:5], state[-3:]
         return jnp.stack([e @ e, e @ x, x @ x, *(scene.dynamics.carried_along(state) - state)[:2]])
 
-    direction = generic_direction(scene, launch, 1)[:, 0]
+    direction = TopModel(scene=scene, launch=launch).direction(1)[:, 0]
     assert_close(jax.jvp(kept, (state,), (direction,))[1], 0.0, atol=1e-15)
     assert np.abs(direction).min() > 0.0
 

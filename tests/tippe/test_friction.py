@@ -177,10 +177,6 @@ class Sideways(tippe.AbstractFriction):
 
     torque: object = eqx.field(converter=jnp.asarray)
 
-    @property
-    def uses_spin(self):
-        return True
-
     def per_normal_force(self, slip):
         force = (-0.3 * slip.x - 0.2 * slip.y, -0.3 * slip.y + 0.2 * slip.x)
         return ContactLoad(force, (None, None, self.torque * jnp.tanh(slip.turning[2])))

@@ -6,7 +6,7 @@ along n follows from the axis, because the contact persists. Cyclic coordinates 
 """
 
 import abc
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -126,8 +126,10 @@ class AbstractDynamics(eqx.Module):
     """Equations of motion, with the precomputed combinations of a scene's numbers; they hold while all margins are
     positive."""
 
-    #: Weight of the body [N], a property of every kind.
-    weight: ClassVar[Float[Array, "..."]]
+    @property
+    def weight(self: Any) -> Float[Array, "..."]:
+        """Weight of the body [N], for equations with the fields `body` and `gravity`."""
+        return self.body.mass * self.gravity
 
     @abc.abstractmethod
     def motion(self, state: Components) -> Any:
@@ -208,11 +210,6 @@ class AbstractRollingDynamics(AbstractContactDynamics):
     """
 
     body: eqx.AbstractVar[Any]
-    gravity: eqx.AbstractVar[Float[Array, "..."]]
-
-    @property
-    def weight(self) -> Float[Array, "..."]:
-        return self.body.mass * self.gravity
 
     @abc.abstractmethod
     def evaluate(self, state: Components) -> tuple[Motion, Vector]:
@@ -354,7 +351,7 @@ class Dynamics(AbstractContactDynamics):
         along_axis = self.axial_excess * spin_momentum
         w1 = self.per_transverse * L[0] + along_axis * e[0]
         w2 = self.per_transverse * L[1] + along_axis * e[1]
-        w3 = self.per_transverse * L[2] + along_axis * e[2] if self.friction.uses_spin else None
+        w3 = self.per_transverse * L[2] + along_axis * e[2]
         slip_x, slip_y = stored(V[0] - R * w2, V[1] + R * w1)
         slip = Slip(slip_x, slip_y, (w1, w2, w3))
         friction = self.friction.per_normal_force(slip)
@@ -387,15 +384,10 @@ class Dynamics(AbstractContactDynamics):
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
         if self.turns is not None:
             turn = self.turns * self.per_transverse * L[2]
-            u_turn, e_turn, L_turn = [turned(vector, turn) for vector in ((u1, u2), e, L)]
-            rate = sum_vectors(rate, (*u_turn[:2], *e_turn, *L_turn, *[None] * len(place)))
+            u_turn, e_turn, L_turn = [(turn * y, -(turn * x)) for x, y, *_ in ((u1, u2), e, L)]
+            rate = sum_vectors(rate, (*u_turn, *e_turn, None, *L_turn, None, *[None] * len(place)))
         spin = (self.per_transverse + self.axial_excess) * spin_momentum
         return Motion(rate, N, friction, slip, path, o, spin, painleve_factor, room)
-
-
-def turned(vector: Vector, rate: Float[Array, "..."]) -> Vector:
-    """Rate of the components of a fixed vector in a frame that turns about n at a given rate [rad/s]."""
-    return rate * vector[1], -(rate * vector[0]), None
 
 
 class RollingDynamics(AbstractRollingDynamics):
@@ -441,7 +433,7 @@ class RollingDynamics(AbstractRollingDynamics):
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
         zero = jnp.zeros_like(F[2])
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
-        slip = Slip(zero, zero, (w[0], w[1], None))
+        slip = Slip(zero, zero, w)
         return Motion(rate, F[2], load, slip, V, o, dot(w, e), 1.0 + zero, room), F
 
     def momentum(self, state: States, w: Vector) -> Vector:

@@ -493,10 +493,6 @@ class AbstractRigidDynamics(AbstractContactDynamics):
     gravity: Float[Array, "..."]
     inverse: SymmetricMatrix
 
-    @property
-    def weight(self) -> Float[Array, "..."]:
-        return self.body.mass * self.gravity
-
     def attitude(self, state: Components) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
         _, e, L, place = parts(state)

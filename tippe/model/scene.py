@@ -460,7 +460,7 @@ class Scene(Bounded, Generic[Body]):
         if launch.angular_velocity is not None:
             w = launch.angular_velocity
             momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(w, w)))
-        place = scale(one, self.frame.place_scales(size))
+        place = tuple(one * size if is_length else one for is_length in self.frame.lengths)
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
@@ -536,19 +536,3 @@ def _mass_from_frame(frame: AbstractFrame, lever: Vector) -> Vector:
     """Vector from the point with which the frame moves to the centre of mass [m], given the vector from there to the
     contact."""
     return (-lever[0], -lever[1], -lever[2] - frame.distance)
-
-
-def generic_direction(scene: Scene, launch: Launch, cells: int, number: int = 0) -> States:
-    """A generic direction, another one for each `number`, tangent to the set of states: the body's axes keep their length and
-    right angle, and the vertical keeps length 1; a body that rolls keeps rolling."""
-    magnitudes, state = scene.scales(launch), scene.state(launch)
-    u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i + number * (1.0 + i) ** 2) for i in range(8))
-    _, e, _, last = parts(state)
-    frame, (place, _) = scene.frame, scene.start(launch)
-    place = frame.frame_motion(place, (scene.body.size, scene.body.size)).place_rate
-    rigid = isinstance(scene.body, AbstractRigidBody)
-    x_axis = cross((r1, r2, r3), tuple(last[-3:])) if rigid else ()
-    direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place, x_axis)
-    if rigid:
-        direction = jax.jvp(scene.dynamics.carried_along, (state,), (direction,))[1]
-    return jnp.broadcast_to(direction.reshape(len(direction), -1), (len(direction), cells))

@@ -22,6 +22,7 @@ from numpy.polynomial import Polynomial, legendre
 from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import AbstractFrame, Vector
 from nonholonomic.integration import Components, States
+from nonholonomic.integration.dense import halved
 
 from ..friction import Frictionless, Slip, length
 from .dynamics import FITS, AbstractContactDynamics, Dynamics, Motion, RollingDynamics
@@ -103,14 +104,8 @@ class Onset(eqx.Module):
     ) -> Float[Array, "..."]:
         """The fraction of the step, after `first`, at which a function of the state falls to zero; 1 if it does not fall
         so far."""
-
-        def halved(_, bracket):
-            low, high = bracket
-            middle = 0.5 * (low + high)
-            is_positive = event(self.at(middle)) > 0.0
-            return jnp.where(is_positive, middle, low), jnp.where(is_positive, high, middle)
-
-        fraction = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
+        bracket = halved(lambda part: event(self.at(part)) > 0.0, first, jnp.ones_like(first))
+        fraction = jax.lax.stop_gradient(bracket[1])
         # Bisection has no derivative, so the implicit function theorem supplies it.
         missing, rise = jax.jvp(lambda part: event(self.at(part)), (fraction,), (jnp.ones_like(fraction),))
         is_inside = (fraction < 1.0) & (rise != 0.0)

@@ -41,7 +41,7 @@ from .impact import (
     still_parting,
     strike,
 )
-from .problems import AbstractFlyingMode, InversionProblem, Quadratures, c_rate
+from .problems import STEM_COSINE, AbstractFlyingMode, InversionProblem, Quadratures, c_rate
 
 #: The mode numbers. The last two are those of a top with a stem: the stem slides; or a sphere is about to strike, and
 #: the state is that of a flight.
@@ -179,8 +179,6 @@ class FlightProblem(AbstractProblem):
     scales: States
     acceleration: Vector
     strikes: Bool[Array, ""] | None = None
-    # As for `InversionProblem`.
-    stem_counts: Float[Array, "..."] | None = None
 
     @property
     def fast(self) -> tuple[bool, bool]:
@@ -197,9 +195,9 @@ class FlightProblem(AbstractProblem):
 
     def event_function(self, state):
         value = cosine(self.scene, flight_state(state)) - self.cos_angle
-        if self.stem_counts is None:
-            return value
-        return jnp.where((state[LAST_BALL] == 1.0) & (self.stem_counts > 0.0), -1.0, value)
+        # After a bounce of the stem, an event of the stem is past.
+        has_bounced = (state[LAST_BALL] == 1.0) & (self.cos_angle == STEM_COSINE)
+        return value if self.strikes is None else jnp.where(has_bounced, -1.0, value)
 
     def domain_margin(self, time, state):
         return least(*self.margins(time, state))
@@ -258,19 +256,19 @@ class OneOfTwo(InversionProblem):
     """Sliding on one of two spheres until theta reaches an angle, the contact ends, or the other sphere is at the
     arena.
 
-    `contact_ball` and `other_ball` are the spheres.
+    `contact_ball` and `other_ball` are the spheres; `on_stem`: whether the first is that of the stem.
     """
 
     scene: Scene[Top] = eqx.field(kw_only=True)
     contact_ball: Ball = eqx.field(kw_only=True)
     other_ball: Ball = eqx.field(kw_only=True)
+    on_stem: Bool[Array, ""] = eqx.field(kw_only=True)
 
     def event_function(self, state: States) -> Lanes:
         # theta is measured from the normal below the top's own sphere; if this sphere slides, the state contains
         # cos(theta).
-        assert self.on_stem is not None
         cosine_of_theta = _cosine_beside(self.scene, self.contact_ball, self.other_ball, state)
-        return self.unless_on_stem(jnp.where(self.on_stem, cosine_of_theta, state[COS_THETA]) - self.cos_angle)
+        return jnp.where(self.on_stem, cosine_of_theta, state[COS_THETA]) - self.cos_angle
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return (*super().margins(time, state), clearance(self.scene, self.contact_ball, self.other_ball, state))
@@ -298,11 +296,12 @@ class ArenaSlide(AbstractFlyingMode):
 
     def problem(self, state: States) -> AbstractProblem:
         contact_ball, other_ball = own_and_other(self.scene.body, self.number)
-        contact = (standing(self.scene, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
+        cos_angle = self.cos_angle_for(self.number == 1)
+        contact = (standing(self.scene, contact_ball), cos_angle, state[:OWN], self.scales[:OWN])
         problem = InversionProblem(*contact, flies=True)
         if other_ball is not None:
             spheres = {"contact_ball": contact_ball, "other_ball": other_ball, "on_stem": self.number == 1}
-            problem = OneOfTwo(*contact, flies=True, stem_counts=self.stem_counts, scene=self.scene, **spheres)
+            problem = OneOfTwo(*contact, flies=True, scene=self.scene, **spheres)
         return self.extended(problem, Quadratures(), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
@@ -352,7 +351,7 @@ class Fly(AbstractFlyingMode):
         rows = [one * self.scene.body.radius] * 3 + [velocity] * 3 + [one] * 3 + [momentum] * 3 + [one] * 2
         acceleration = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
         start = (state[:OWN], jnp.stack(rows))
-        flight = FlightProblem(self.scene, self.cos_angle, *start, acceleration, self.strikes, self.stem_counts)
+        flight = FlightProblem(self.scene, self.cos_angle, *start, acceleration, self.strikes)
         return self.extended(flight, QuadraturesInFlight(self.scene.body), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
@@ -387,8 +386,7 @@ class Fly(AbstractFlyingMode):
         throws = rests = takes_over = no
         if other_ball is not None:
             throws, rests = _at_other(scene, flying, ground, other_ball, blow)
-        if self.stem_counts is not None:
-            takes_over = (state[LAST_BALL] == 0.0) & ((number == 1) | rests) & ~misses & (self.stem_counts > 0.0)
+            takes_over = (state[LAST_BALL] == 0.0) & ((number == 1) | rests) & ~misses & self.awaits_stem
         flies = blow.rebounds | throws
         state_after = jnp.where(flies, in_flight(flying.place, ground.axes, blow.free), in_contact(ground, blow.free))
         if self.with_quadratures:
@@ -441,9 +439,8 @@ def airborne_modes(
     arguments = (scene, problem.scales, problem.cos_angle, with_quadratures)
     if scene.body.stem is None:
         return (ArenaSlide(*arguments, jnp.asarray(0)), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)
-    event = {"stem_counts": problem.stem_counts}
-    slides = [ArenaSlide(*arguments, jnp.asarray(number), **event) for number in (0, 1)]
-    flies, strikes = (Fly(*arguments, jnp.asarray(strikes), last, **event) for strikes in (False, True))
+    slides = [ArenaSlide(*arguments, jnp.asarray(number)) for number in (0, 1)]
+    flies, strikes = (Fly(*arguments, jnp.asarray(strikes), last) for strikes in (False, True))
     return (slides[0], flies, slides[1], strikes), _first_mode(scene, problem.states)
 
 

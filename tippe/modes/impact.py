@@ -30,7 +30,7 @@ from nonholonomic.geometry import Component, Vector, add, cross, dot, multiply, 
 from nonholonomic.integration import AbstractProblem, Lanes, Outcome, Settings, States, solve_ensemble
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
-from ..friction import AbstractFriction, ContactLoad, SetValuedCoulomb, Slip, length
+from ..friction import AbstractFriction, SetValuedCoulomb, Slip, length
 from ..model.body import ContactGeometry, Top
 from ..model.dynamics import AbstractDynamics, Dynamics, angular_velocity, joined, parts
 from ..model.scene import Scene
@@ -152,22 +152,6 @@ def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float
     return body.mass * (0.5 * dot(free.velocity, free.velocity) + gravity * free.height) + rotation
 
 
-def energy_between(
-    scene: Scene[Top], state: States, number: Int[Array, "..."]
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """The least and the greatest energy [J] that a state at the end of a mode, or of a flight from there, may have.
-
-    In flight, the state does not contain the speed of the sphere along the normal.
-
-    **Arguments:** `number`: index of the mode in `plane.py`; where both spheres touch, either determines the height.
-    """
-    main, stem = balls(scene.body)[0], balls(scene.body)[-1]
-    contact_ball = select(number == 1, stem, main)
-    free = as_free_body(scene.body, contact_ball, state)
-    total = energy(scene.body, scene.gravity, free)
-    return total - 0.5 * scene.body.mass * free.velocity[2] ** 2, total
-
-
 #: Relative tolerance of an impact's integration: impacts are rare, so this cost is small. A tenfold value changes
 #: inversion times after hundreds of impacts by 1e-14.
 TOLERANCE = 1e-12
@@ -201,6 +185,10 @@ class Approach(NamedTuple):
     response: tuple[Vector, Vector, Vector]
     axis: Vector
     angular_velocity: Vector
+
+    def change(self, impulse: Vector) -> Vector:
+        """Change of the velocity of the contact point [m/s] by an impulse of the force [N s]."""
+        return tuple(dot(column, impulse) for column in self.response)
 
 
 class ContactImpulse(NamedTuple):
@@ -239,25 +227,21 @@ class Impact(AbstractProblem):
         """Changes of the velocity of the contact point [m/s] and of the angular velocity [rad/s] by an impulse."""
         contact, (force, torque) = self.approach, impulse
         angular_change = angular_velocity(self.body, contact.axis, torque)
-        velocity = sum_vectors(
-            tuple(dot(column, force) for column in contact.response), cross(angular_change, contact.arm)
-        )
+        velocity = sum_vectors(contact.change(force), cross(angular_change, contact.arm))
         whole_torque = sum_vectors(cross(contact.arm, force), torque)
         return velocity, angular_velocity(self.body, contact.axis, whole_torque)
 
-    def load(self, velocity: Vector, w: Vector) -> ContactLoad:
-        """Friction force and torque per unit normal impulse."""
-        drilling = w[2] if self.friction.uses_spin else None
-        return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (w[0], w[1], drilling)))
-
     def start(self) -> tuple[Float[Array, "rows cells"], Float[Array, "rows cells"]]:
-        has_torque = self.load(self.approach.velocity, self.approach.angular_velocity).torque != (None, None, None)
+        x, y, _ = self.approach.velocity
+        load = self.friction.per_normal_force(Slip(x, y, self.approach.angular_velocity))
+        has_torque = load.torque != (None, None, None)
         zeros = jnp.zeros((5 if has_torque else 2, *self.gained.shape))
         return zeros, jnp.ones_like(zeros)
 
     def field(self, time: Lanes, state: Float[Array, "rows cells"]) -> Float[Array, "rows cells"]:
         contact, (velocity, w) = self.approach, self.changes(self.impulse(time, state))
-        load = self.load(sum_vectors(contact.velocity, velocity), sum_vectors(contact.angular_velocity, w))
+        x, y, _ = sum_vectors(contact.velocity, velocity)
+        load = self.friction.per_normal_force(Slip(x, y, sum_vectors(contact.angular_velocity, w)))
         torque = scale(1.0 / self.radius, load.torque) if len(state) > 2 else ()
         rows = [jnp.zeros_like(time) if component is None else component for component in (*load.force, *torque)]
         return jnp.stack(jnp.broadcast_arrays(*rows, time)[:-1])
@@ -277,12 +261,6 @@ class Impact(AbstractProblem):
         )
         shortfall = -gain * response[2][2] / self.speed**2
         return least(missing, jnp.where(approaches > shortfall, approaches, shortfall))
-
-    def ended(self, time: Lanes, state: Float[Array, "rows cells"]) -> ContactImpulse:
-        """The impulses of an impact whose end has been located, corrected."""
-        rates = self.field(time, state)
-        step = newton_step(self.domain_margin, (time, state), (jnp.ones_like(time), rates))
-        return self.impulse(time + step, state + step * rates)
 
 
 def newton_step(margin: Callable[..., Lanes], point: tuple[Array, ...], rates: tuple[Array, ...]) -> Lanes:
@@ -336,7 +314,10 @@ def resolve_impact(
         impulse, status = _coulomb_impulse(impact, friction.mu)
     else:
         outcome = _solved(impact, absolute=1.0)
-        impulse, status = impact.ended(outcome.end_time, outcome.state), outcome.status
+        time, state, status = outcome.end_time, outcome.state, outcome.status
+        rates = impact.field(time, state)
+        step = newton_step(impact.domain_margin, (time, state), (jnp.ones_like(time), rates))
+        impulse = impact.impulse(time + step, state + step * rates)
     velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, impulse.force))
     momentum = sum_vectors(free.momentum, cross(contact.arm, impulse.force), impulse.torque)
     return FreeBody(velocity, free.height, free.axis, momentum), status != LEFT_DOMAIN
@@ -409,8 +390,7 @@ class Skid(AbstractProblem):
     def velocity(self, state: Float[Array, "3 cells"]) -> Vector:
         """Velocity of the contact point [m/s]."""
         contact, impulse = self.impact.approach, self.impact.impulse(state[2], state[:2])
-        changes = tuple(dot(column, impulse.force) for column in contact.response)
-        return sum_vectors(contact.velocity, changes)
+        return sum_vectors(contact.velocity, contact.change(impulse.force))
 
     def start(self) -> tuple[Float[Array, "3 cells"], Float[Array, "3 cells"]]:
         zeros = jnp.zeros((3, *self.pace.shape))
@@ -452,25 +432,22 @@ def _remaining_impulse(impact: Impact, mu: Float[Array, "..."], impulse: Vector)
     a, b, c = W[0][0], W[0][1], W[1][1]
     f1, f2 = sticking_force((a, b, c), (W[0][2], W[1][2]), mu)
 
-    def change(force: Vector) -> Vector:
-        return tuple(dot(column, force) for column in W)
-
     # Where the contact sticks, the impulse first removes the remaining slip.
-    v1, v2, _ = sum_vectors(contact.velocity, change(impulse))
+    v1, v2, _ = sum_vectors(contact.velocity, contact.change(impulse))
     sticks, determinant = f1 * f1 + f2 * f2 < mu * mu, a * c - b * b
     stopping_impulse = (
         jnp.where(sticks, (b * v2 - c * v1) / determinant, 0.0),
         jnp.where(sticks, (b * v1 - a * v2) / determinant, 0.0),
     )
     impulse = sum_vectors(impulse, (*stopping_impulse, None))
-    velocity, impulse_direction = sum_vectors(contact.velocity, change(impulse)), (f1, f2, jnp.ones_like(f1))
+    velocity, impulse_direction = sum_vectors(contact.velocity, contact.change(impulse)), (f1, f2, jnp.ones_like(f1))
     # The impact ends as in `Impact.domain_margin`: the normal velocity is linear in the impulse, and the energy is
     # quadratic.
-    gains = change(impulse_direction)
+    gains = contact.change(impulse_direction)
     normal_impulse = greatest((contact.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
     compressed = greatest(-velocity[2], 0.0) / gains[2]
     power, stiff = dot(impulse_direction, velocity), dot(impulse_direction, gains)
-    gain = least(dot(impulse, contact.velocity) + 0.5 * dot(impulse, change(impulse)), 0.0)
+    gain = least(dot(impulse, contact.velocity) + 0.5 * dot(impulse, contact.change(impulse)), 0.0)
     restored = (-power + jnp.sqrt(power * power - 2.0 * gain * stiff)) / stiff
     return sum_vectors(
         scale(least(normal_impulse, greatest(compressed, restored)), impulse_direction), (*stopping_impulse, None)
@@ -574,10 +551,6 @@ class LeaningDynamics(AbstractDynamics):
         """The equations for the top of a scene."""
         return cls(scene.body, scene.friction, scene.gravity)
 
-    @property
-    def weight(self) -> Float[Array, "..."]:
-        return self.body.mass * self.gravity
-
     def motion(self, state: States) -> LeaningMotion:
         """Evaluate the equations of motion.
 
@@ -596,7 +569,7 @@ class LeaningDynamics(AbstractDynamics):
         precession = (p - c * axial_rate) / I1
         rolling = axial_rate / I1 + (1.0 / I3 - 1.0 / I1) * b
 
-        w = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.uses_spin else None)
+        w = (rolling * e[0], rolling * e[1], rolling * c + precession)
         velocities = [sum_vectors(u, scale(rolling * R + precession * a, perpendicular)) for a, R in spheres]
         slips = [Slip(x, y, w) for x, y in velocities]
         loads = [self.friction.per_normal_force(slip) for slip in slips]
@@ -645,12 +618,12 @@ class LeaningDynamics(AbstractDynamics):
         it dissipates energy after the impact of the other sphere (det G > 0).
         """
         spheres, zero = balls(self.body), jnp.zeros_like(free.height)
-        w1, w2, w3 = angular_velocity(self.body, free.axis, free.momentum)
+        w = angular_velocity(self.body, free.axis, free.momentum)
         forces, torques, gains = [], [], []
         for ball in spheres:
             contact = approach(self.body, ball, free)
             x, y, _ = contact.velocity
-            slip = Slip(x, y, (w1, w2, w3 if self.friction.uses_spin else None))
+            slip = Slip(x, y, w)
             load = self.friction.per_normal_force(slip)
             forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
             torques.append(sum_vectors(cross(contact.arm, forces[-1]), load.torque))

@@ -398,11 +398,11 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 
     def problem(self, state: States) -> AbstractProblem:
         contact_ball, other_ball = own_and_other(self.scene.body, self.number)
-        contact = (standing_on(self.scene.dynamics, contact_ball), self.cos_angle, state[:OWN], self.scales[:OWN])
+        cos_angle = self.cos_angle_for(self.number == 1)
+        contact = (standing_on(self.scene.dynamics, contact_ball), cos_angle, state[:OWN], self.scales[:OWN])
         problem = InversionProblem(*contact, flies=True)
         if other_ball is not None:
-            spheres = {"contact_ball": contact_ball, "other_ball": other_ball, "on_stem": self.number == 1}
-            problem = SlidingOnOne(*contact, flies=True, stem_counts=self.stem_counts, **spheres)
+            problem = SlidingOnOne(*contact, flies=True, contact_ball=contact_ball, other_ball=other_ball)
         return self.extended(problem, Quadratures(of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
@@ -469,13 +469,13 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         if air.falls is not None:
             air_after, has_landed = select(air.falls, air, air_after), air.falls | has_landed
         air_landed = land(self.scene, air_after)
-        if air.falls is not None and self.stem_counts is not None:
+        if air.falls is not None:
             # The stem begins to carry the top as it bears a force or an impulse, if the sphere was the last to touch before.
             # A sphere that is about to strike without a flight is not the sphere that touched last.
             last_ball = jnp.where(air.falls, 1 - air.ball, air.ball)
             # On both spheres, the stem carries a part of the top, but the sphere still touches.
             rests_on_stem = ~air_landed.open & (air_landed.ball == 1 if self.last else air_landed.ball != 0)
-            takes_over = (last_ball == 0) & ((air_after.ball == 1) | rests_on_stem) & (self.stem_counts > 0.0)
+            takes_over = (last_ball == 0) & ((air_after.ball == 1) | rests_on_stem) & self.awaits_stem
             air_landed = air_landed._replace(
                 crossing_time=jnp.where(takes_over, air_landed.elapsed, air_landed.crossing_time),
                 status=air_landed.status if self.last else jnp.where(takes_over, CROSSED, air_landed.status),
@@ -504,12 +504,10 @@ class Lean(AbstractFlyingMode):
     rare = True
 
     def problem(self, state: States) -> AbstractProblem:
-        contact = (LeaningDynamics.of(self.scene), self.cos_angle, state[:OWN], self.scales[:OWN])
         # The stem carries a part of the top, so its first event has happened; the sphere still touches, so, with `last`,
         # that event has not.
-        on_stem = jnp.asarray(not self.last)
-        problem = InversionProblem(*contact, stem_counts=self.stem_counts, on_stem=on_stem, flies=True)
-        return self.extended(problem, Quadratures(of_mass=True), state)
+        contact = (LeaningDynamics.of(self.scene), self.cos_angle_for(not self.last), state[:OWN], self.scales[:OWN])
+        return self.extended(InversionProblem(*contact, flies=True), Quadratures(of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         return shown(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
@@ -521,9 +519,7 @@ class Lean(AbstractFlyingMode):
         state = jnp.concatenate([state_at_rest, state[OWN:]])
         zero = jnp.zeros_like(state[0])
         running, zeros = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
-        leaves_sphere = jnp.zeros(zero.shape, bool)
-        if self.last and self.stem_counts is not None:
-            leaves_sphere = (number == 1) & (self.stem_counts > 0.0)
+        leaves_sphere = (number == 1) & self.awaits_stem & self.last
         return Transition(number, state, zero, running, jnp.where(leaves_sphere, 0.0, jnp.inf), zeros)
 
 
@@ -540,11 +536,10 @@ def hopping_modes(
     - `last`: whether the last crossing counts; `with_quadratures`: as for `AbstractFlyingMode`.
     """
     spheres, arguments = balls(scene.body), (scene, problem.scales, problem.cos_angle, with_quadratures)
-    event = {"stem_counts": problem.stem_counts}
-    slides = tuple(Slide(*arguments, jnp.asarray(number), last, **event) for number in range(len(spheres)))
+    slides = tuple(Slide(*arguments, jnp.asarray(number), last) for number in range(len(spheres)))
     if len(spheres) == 1:
         return slides, jnp.zeros(problem.states.shape[1:], int)
-    return (*slides, Lean(*arguments, last, **event)), _first_mode(scene.body, problem.states)
+    return (*slides, Lean(*arguments, last)), _first_mode(scene.body, problem.states)
 
 
 @compiled_setup

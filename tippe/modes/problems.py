@@ -14,7 +14,7 @@ from nonholonomic.integration import AbstractPassive, AbstractProblem, Component
 from nonholonomic.validation import as_number
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, NO_COSINE, AbstractDynamics, Dynamics, parts
+from ..model.dynamics import COS_THETA, AbstractDynamics, Dynamics, parts
 from ..model.rigid import AbstractRigidDynamics
 from ..model.scene import Launch, Scene
 from ..model.stick_slip import StickSlip
@@ -28,6 +28,10 @@ class StemContact(eqx.Module):
 
 #: The inclination [rad] at which a body without a stem counts as turned over.
 INVERTED = 0.95 * math.pi
+
+#: Stands for the cosine of the angle where the event is that the stem first carries the top, so that one program serves both;
+#: and the cosine that puts every state beyond the event.
+STEM_COSINE, BEYOND = -3.0, 2.0
 
 
 def event_of(scene: Scene, angle: Any) -> Float[Array, "..."] | StemContact:
@@ -53,9 +57,8 @@ class InversionProblem(AbstractProblem):
     """Launches that end when theta reaches an angle or the contact is lost or jams.
 
     If `cos_angle` is `None`, they end when the spin about the arena's normal reverses; `spin` is the initial spin
-    [rad/s]. For a top with a stem, `stem_counts` is 1 if the event is that the stem first carries the top, and 0 if the
-    event is an angle; one program serves both. If the event counts, a run that starts `on_stem` is beyond it; later,
-    reset maps determine when the stem takes over.
+    [rad/s]. If the event is that the stem first carries the top, no angle ends a run: reset maps determine when the stem
+    takes over.
     """
 
     dynamics: AbstractDynamics
@@ -64,8 +67,6 @@ class InversionProblem(AbstractProblem):
     states: States
     scales: States
     spin: Float[Array, "..."] | None = None
-    stem_counts: Float[Array, "..."] | None = None
-    on_stem: Bool[Array, "..."] | None = None
     # Whether a flight follows where the contact is lost.
     flies: bool = eqx.field(static=True, default=False, kw_only=True)
 
@@ -90,13 +91,7 @@ class InversionProblem(AbstractProblem):
             assert isinstance(self.dynamics, StickSlip | AbstractRigidDynamics)
             assert self.spin is not None
             return self.dynamics.normal_spin(state) / self.spin
-        return self.unless_on_stem(state[COS_THETA] - self.cos_angle)
-
-    def unless_on_stem(self, value: Lanes) -> Lanes:
-        """The event function, or -1 if the stem carries the top and this counts."""
-        if self.stem_counts is None or self.on_stem is None:
-            return value
-        return jnp.where(self.on_stem & (self.stem_counts > 0.0), -1.0, value)
+        return state[COS_THETA] - self.cos_angle
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes:
         return least(*self.margins(time, state))
@@ -120,9 +115,8 @@ def _inversion_problem(
     dynamics = scene.turning_dynamics
     if angle is None:
         return InversionProblem(dynamics, None, states, scales, dynamics.normal_spin(states))
-    cos_angle = jnp.asarray(NO_COSINE) if isinstance(angle, StemContact) else jnp.cos(angle)
-    stem_counts = jnp.asarray(float(isinstance(angle, StemContact))) if scene.has_stem else None
-    return InversionProblem(dynamics, cos_angle, states, scales, stem_counts=stem_counts)
+    cos_angle = jnp.asarray(STEM_COSINE) if isinstance(angle, StemContact) else jnp.cos(angle)
+    return InversionProblem(dynamics, cos_angle, states, scales)
 
 
 # Motion on one smooth contact with the path on the arena, the orientation about the axis and the work of friction.
@@ -192,8 +186,7 @@ class AbstractFlyingMode(AbstractBatchedMode):
     """A mode of runs that continue through flights.
 
     - `scene`: a scene with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
-    - `cos_angle`: cosine of the theta that is the event.
-    - `stem_counts`: as for `InversionProblem`; `None` for a top without a stem.
+    - `cos_angle`: cosine of the theta that is the event, or `STEM_COSINE`.
     - `with_quadratures`: whether this is a single run whose path is kept, with passive quadratures after its state.
     """
 
@@ -201,7 +194,15 @@ class AbstractFlyingMode(AbstractBatchedMode):
     scales: States
     cos_angle: Float[Array, "..."]
     with_quadratures: bool = eqx.field(static=True)
-    stem_counts: Float[Array, "..."] | None = eqx.field(kw_only=True, default=None)
+
+    @property
+    def awaits_stem(self) -> Bool[Array, "..."]:
+        """Whether the event is that the stem first carries the top."""
+        return self.cos_angle == STEM_COSINE
+
+    def cos_angle_for(self, on_stem: Bool[Array, ""] | bool) -> Float[Array, "..."]:
+        """The cosine of the angle for runs in which the stem carries the top or not: if so, an event of the stem is past."""
+        return jnp.where(on_stem & self.awaits_stem, BEYOND, self.cos_angle)
 
     def extended(self, problem: AbstractProblem, passive: AbstractPassive, state: States) -> AbstractProblem:
         """The problem for given states, including the passive quadratures."""

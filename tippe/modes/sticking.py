@@ -18,7 +18,7 @@ from ..model.rigid import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.stick_slip import ContactMode, Onset, StickSlip
 from . import airborne
-from .impact import balls, energy_between, gap_rate
+from .impact import as_free_body, balls, energy, gap_rate, select
 from .problems import InversionProblem, Quadratures
 
 # Runs with stick and slip: the cells of a table, and a single run with its path. With flights, the flight is as in
@@ -175,7 +175,11 @@ def energy_in(scene: Scene, state: States, mode: Int[Array, " cells"]) -> tuple[
     """The least and the greatest energy [J] that a state at the end of a mode, or of a flight in closed form from there,
     may have. **Arguments:** `mode`: the index of the mode."""
     if scene.flies_in_closed_form:
-        return energy_between(scene, state, mode)
+        # Where both spheres touch, either determines the height. The state has no speed of the sphere along the normal, which a
+        # flight may give it.
+        free = as_free_body(scene.body, select(mode == 1, balls(scene.body)[-1], balls(scene.body)[0]), state)
+        total = energy(scene.body, scene.gravity, free)
+        return total - 0.5 * scene.body.mass * free.velocity[2] ** 2, total
     energy_above, flies = 0.0, scene.contact == "hybrid"
     if flies:
         state, distance, rate = above_the_ground(scene, state, mode)

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
@@ -27,9 +28,9 @@ from nonholonomic.validation import Bound, Function, all_bounds, explaining, leg
 
 from ..friction import NoSlip
 from ..model.body import Top
-from ..model.dynamics import LOSSES, NO_COSINE, inclination, parts
+from ..model.dynamics import LOSSES, NO_COSINE, inclination, joined, parts
 from ..model.rigid import AbstractRigidBody
-from ..model.scene import SPINS, Launch, Scene, generic_direction
+from ..model.scene import SPINS, Launch, Scene
 from ..modes.airborne import airborne_modes
 from ..modes.plane import hopping_modes
 from ..modes.problems import BEHIND_PATH, INVERTED, InversionProblem, StemContact, event_of, trajectory_problem
@@ -178,7 +179,18 @@ class TopModel(AbstractSceneModel):
         return TopModel(scene=_integrated(self.scene), launch=self.launch)
 
     def direction(self, cells: int, number: int = 0) -> Float[Array, "components cells"]:
-        return generic_direction(self.scene, self.launch, cells, number)
+        # The body's axes keep their length and right angle, and the vertical keeps length 1; a body that rolls keeps rolling.
+        scene, launch = self.scene, self.launch
+        magnitudes, state = scene.scales(launch), scene.state(launch)
+        u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i + number * (1.0 + i) ** 2) for i in range(8))
+        _, e, _, last = parts(state)
+        place = scene.frame.frame_motion(scene.start(launch)[0], (scene.body.size, scene.body.size)).place_rate
+        rigid = isinstance(scene.body, AbstractRigidBody)
+        x_axis = cross((r1, r2, r3), tuple(last[-3:])) if rigid else ()
+        direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place, x_axis)
+        if rigid:
+            direction = jax.jvp(scene.dynamics.carried_along, (state,), (direction,))[1]
+        return jnp.broadcast_to(direction.reshape(len(direction), -1), (len(direction), cells))
 
     @property
     def roots(self) -> dict[str, PyTree]:

@@ -79,7 +79,7 @@ def check_run(scene: Any, launch: Any, t1: Number, tolerance: Number, lists: str
         warn(f"t1 = {np.max(t1):g} s is long for a top; times are in seconds: did you mean t1={np.max(t1) / 1e3:g}?")
 
 
-def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: object, angle: Any) -> None:
+def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: object, angle: object) -> None:
     """Warn if the scene has no friction, if the top stands exactly upright on a level plane or is inverted already, or if
     it is too slow to turn over, and would not be if its spin were in turns a second.
 
@@ -144,22 +144,17 @@ def check_smooth(scene: Scene, caller: str) -> None:
         )
 
 
-def require_rigid(scene: Scene) -> None:
-    """Raise `ValueError` for a body that cannot reverse its spin."""
+def check_reversible(scene: Scene, launch: Launch, values: Mapping[str, Any] | None = None) -> None:
+    """Raise `ValueError` for a body that cannot reverse its spin, and for a launch without spin.
+
+    **Arguments:** `values`: full name of a number -> values in place of the launch's own.
+    """
     if not isinstance(scene.body, AbstractRigidBody):
         kind = type(scene.body).__name__
         raise ValueError(
             f"body = {kind} must be an Ellipsoid or a RigidBody for times of reversal: a body of revolution keeps its "
             "sense of rotation"
         )
-
-
-def check_reversible(scene: Scene, launch: Launch, values: Mapping[str, Any] | None = None) -> None:
-    """Raise `ValueError` for a body that cannot reverse its spin, and for a launch without spin.
-
-    **Arguments:** `values`: full name of a number -> values in place of the launch's own.
-    """
-    require_rigid(scene)
     spin = (values or {}).get("launch.spin", launch.spin)
     if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
         raise ValueError("spin = 0.0 must not be zero: a spin of zero cannot reverse")
@@ -419,7 +414,6 @@ def reversal_table(
     ```
     """
     require_outside((scene, launch, theta, spin, azimuth, mu, axes, t1), "reversal_table", "reversal_time")
-    require_rigid(scene)
     launch_values = {"launch": launch, "theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
     return event_table(scene, launch_values, axes, t1, None, options)
@@ -467,23 +461,17 @@ def event_table(
     }
     job = TableJob(model, form, float(t1), crossing, settings, slopes, options.errors, by_diffrax=method == "diffrax")
     table = compute_table(job, grid, request, options)
-    warn_of_long_runs(table, float(t1), options.max_steps)
     # Tables whose variables stay in the file are not checked.
-    is_checked = model.smooth and isinstance(table.variables, dict)
-    unresolved = np.sum(table.variables["status"] == "unresolved") if is_checked else 0
-    if unresolved:
-        warn(f"{unresolved} of {math.prod(table.shape)} runs are unresolved: {why_unresolved(smooth=True)}")
-    return table
-
-
-def warn_of_long_runs(table: Table, t1: float, max_steps: int) -> None:
-    """Warn of runs that needed more than the allowed steps. Tables whose variables stay in the file are not checked."""
     if not isinstance(table.variables, dict):
-        return
-    is_long = (table.variables["status"] == "failed") & (table.variables["steps"] >= max_steps)
+        return table
+    status, steps = table.variables["status"], table.variables["steps"]
+    is_long = (status == "failed") & (steps >= options.max_steps)
     if is_long.any():
         end = float(np.min(table.variables["end_time"][is_long]))
-        warn(f"{is_long.sum()} of {is_long.size} runs have failed: {too_many_steps(t1, max_steps, end)}")
+        warn(f"{is_long.sum()} of {status.size} runs have failed: {too_many_steps(float(t1), options.max_steps, end)}")
+    if model.smooth and (unresolved := np.sum(status == "unresolved")):
+        warn(f"{unresolved} of {status.size} runs are unresolved: {why_unresolved(smooth=True)}")
+    return table
 
 
 @of_launches

@@ -421,8 +421,7 @@ def theta_over_time(
     model = TopModel.timed(**cells, angle=event_of(scene, None))
     ensemble = Ensemble.of(model, size, settings.tolerance, False)
     # No inclination exceeds pi, so no run ends before its time, in the programs of the table.
-    never = {"cos_angle": jnp.asarray(-1.0)} | ({"stem_counts": jnp.zeros(())} if scene.has_stem else {})
-    modes = tuple(dataclasses.replace(mode, **never) for mode in ensemble.modes or ())
+    modes = tuple(dataclasses.replace(mode, cos_angle=jnp.asarray(-1.0)) for mode in ensemble.modes or ())
     ensemble = dataclasses.replace(ensemble, modes=modes)
     parts = -(-len(times) // size)
     ends = np.pad(times, (0, size * parts - len(times)), mode="edge").reshape(size, parts)
