@@ -57,7 +57,7 @@ Element = Any
 Elements = np.ndarray
 
 
-#: Elements, or an array of JAX with one more axis, of lanes.
+#: Elements, or an array of JAX.
 Movable = TypeVar("Movable", Elements, Array)
 
 #: For each factor of a product, some of its axes.
@@ -69,27 +69,39 @@ class TooLarge(Exception):
 
 
 def by_components(function: Function, *shapes: PyTree) -> Function:
-    """Convert a function of numbers to a function of vectors of lanes.
+    """Convert a function of arrays that returns numbers to a function of lanes, number by number.
 
     **Arguments:**
 
-    - `function`: takes and returns scalars.
+    - `function`: takes arrays, and returns scalars.
     - `shapes`: shapes of its arguments, as for `jax.eval_shape`.
 
-    **Returns:** the function, whose arguments are scalars or have one number per lane. It raises `TooLarge` for a
-    function that is faster with arrays.
+    **Returns:** the function, whose arguments have one more axis than these, of lanes, or are the same for all lanes. It
+    raises `TooLarge` for a function that is faster with arrays.
     """
 
     def evaluated(*args: PyTree) -> PyTree:
         closed, shape = traced(function, *shapes)
-        evaluation, leaves = Evaluation(), [np.empty((), object) for _ in jax.tree.leaves(shapes)]
-        for elements, number in zip(leaves, jax.tree.leaves(args), strict=True):
-            elements[()] = number
-        results = evaluation.read(closed, leaves)
+        evaluation = Evaluation()
+        results = evaluation.read(closed, list(map(_elements, jax.tree.leaves(args), jax.tree.leaves(shapes))))
         numbers = evaluation.with_hidden([result.item() for result in results])
         return jax.tree.unflatten(jax.tree.structure(shape), [jnp.asarray(number) for number in numbers])
 
     return evaluated
+
+
+def _elements(array: Any, own: jax.ShapeDtypeStruct) -> Elements:
+    """The elements of an array that may have lanes in its last axis, besides its own axes."""
+    elements = np.empty(own.shape, object)
+    if own.shape == ():
+        elements[()] = array
+        return elements
+    flat = array.reshape(-1, *array.shape[len(own.shape) :])
+    # The derivative of this operation joins all elements at once.
+    rows = jax.lax.split(flat, (1,) * len(flat))
+    for index, row in zip(np.ndindex(own.shape), rows, strict=True):
+        elements[index] = row[0]
+    return elements
 
 
 def over_lanes(function: Function, *arguments: PyTree) -> PyTree:
@@ -314,12 +326,12 @@ REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "r
 REDUCTIONS |= {"reduce_and": "and", "reduce_or": "or"}
 
 
-def _broadcast(equation: Equation, elements: Movable) -> Movable:
+def _broadcast(equation: Equation, elements: Elements) -> Elements:
     shape, places = equation.params["shape"], equation.params["broadcast_dimensions"]
-    inner, own = [1] * len(shape), elements.shape[len(places) :]
+    inner = [1] * len(shape)
     for axis, place in enumerate(places):
         inner[place] = elements.shape[axis]
-    return elements.__array_namespace__().broadcast_to(elements.reshape((*inner, *own)), (*shape, *own))
+    return np.broadcast_to(elements.reshape(inner), shape)
 
 
 def _padded(equation: Equation, elements: Elements, filling: Elements) -> Elements:
@@ -336,29 +348,18 @@ def _padded(equation: Equation, elements: Elements, filling: Elements) -> Elemen
     return result
 
 
-def _sliced(equation: Equation, elements: Movable) -> Movable:
+def _sliced(equation: Equation, elements: Elements) -> Elements:
     params = equation.params
     steps = params["strides"] or (1,) * len(params["start_indices"])
     return elements[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
 
 
-def _reshaped(equation: Equation, elements: Movable) -> Movable:
-    own = elements.shape[len(equation.invars[0].aval.shape) :]
-    return elements.reshape((*equation.outvars[0].aval.shape, *own))
+def _reshaped(equation: Equation, elements: Elements) -> Elements:
+    return elements.reshape(equation.outvars[0].aval.shape)
 
 
-def _transposed(equation: Equation, elements: Movable) -> Movable:
-    order = equation.params["permutation"]
-    return elements.transpose((*order, *range(len(order), elements.ndim)))
-
-
-def _tiled(equation: Equation, elements: Movable) -> Movable:
-    counts = equation.params["reps"]
-    return elements.__array_namespace__().tile(elements, (*counts, *[1] * (elements.ndim - len(counts))))
-
-
-#: Operations that move numbers, for arrays that may have one more axis, of lanes, at the end; `pad` for elements only.
-MOVES: dict[str, Callable[..., Any]] = {
+#: Operations that move elements.
+MOVES: dict[str, Callable[..., Elements]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda equation, *parts: np.concatenate(parts, axis=equation.params["dimension"]),
     "expand_dims": _reshaped,
@@ -368,8 +369,8 @@ MOVES: dict[str, Callable[..., Any]] = {
     "slice": _sliced,
     "squeeze": _reshaped,
     "stack": lambda equation, *parts: np.stack(parts, axis=equation.params["axis"]),
-    "tile": _tiled,
-    "transpose": _transposed,
+    "tile": lambda equation, elements: np.tile(elements, equation.params["reps"]),
+    "transpose": lambda equation, elements: elements.transpose(equation.params["permutation"]),
 }
 
 
@@ -425,12 +426,9 @@ def factors(
 
 # Map a function over the last axis of its arguments, and keep this axis last.
 #
-# `jax.vmap` moves the mapped axis to the front of products and of arrays that are joined. Where the axis counts lanes,
-# compilers vectorise only along the last axis, so this costs up to ten times as much for a function of medium size, such as
-# a network of a thousand weights.
-
-#: Operations whose parameters do not change with an axis at the end, besides those that move numbers.
-UNCHANGED = (*REDUCTIONS, "argmax", "argmin", "cumsum", "cumprod", "rev", "squeeze", "concatenate", "split", "stack")
+# `jax.vmap` moves the mapped axis of a whole function to the front. Where the axis counts lanes, compilers vectorise only along
+# the last axis, so this costs up to ten times as much for a function of medium size, such as a network of a thousand
+# weights. Here each operation is mapped on its own, and XLA drops the transpositions between them.
 
 
 def over_last_axis(function: Function, *shapes: PyTree) -> Function:
@@ -439,47 +437,35 @@ def over_last_axis(function: Function, *shapes: PyTree) -> Function:
     **Arguments:** `function`: function of arrays; `shapes`: shapes of its arguments, as for `jax.eval_shape`.
 
     **Returns:** the function, whose arguments have one more axis than these, or are the same for all members.
-
-    **Raises:** `TooLarge` for operations that it does not know.
     """
 
     def mapped(*arguments: PyTree) -> PyTree:
         closed, shape = traced(function, *shapes)
         leaves, expected = jax.tree.leaves(arguments), jax.tree.leaves(shapes)
-        size = next(leaf.shape[-1] for leaf, own in zip(leaves, expected, strict=True) if leaf.ndim > own.ndim)
-        results = read_program(closed, leaves, functools.partial(_applied, size=size))
-        outputs = [_with_axis(result, aval.ndim, size) for result, aval in zip(results, closed.out_avals, strict=True)]
+        size = next(leaf.shape[-1] for leaf, own in zip(leaves, expected, strict=True) if jnp.ndim(leaf) > own.ndim)
+        results = map(_with_axis, read_program(closed, leaves, _applied), closed.out_avals)
+        outputs = [jnp.broadcast_to(result, (*result.shape[:-1], size)) for result in results]
         return jax.tree.unflatten(jax.tree.structure(shape), outputs)
 
     return mapped
 
 
-def _with_axis(value: ArrayLike, ndim: int, size: int) -> Array:
-    """A value with the mapped axis, which has `ndim` axes of its own."""
+def _with_axis(value: ArrayLike, own: jax.ShapeDtypeStruct) -> Array:
+    """A value with the mapped axis; of length 1 if the value is the same for all members."""
     value = jnp.asarray(value)
-    return value if value.ndim > ndim else jnp.broadcast_to(value[..., None], (*value.shape, size))
+    return value if value.ndim > own.ndim else value[..., None]
 
 
-def _applied(equation: Equation, operands: list[Array], size: int) -> Sequence[Array] | Program:
+def _applied(equation: Equation, operands: list[Array]) -> Sequence[Array] | Program:
     """The results of an equation, with one more axis where an operand has one more."""
-    name, params, own = equation.primitive.name, equation.params, [atom.aval.ndim for atom in equation.invars]
-    if name in ("jit", "pjit"):
-        return params["jaxpr"]
-    if not any(jnp.ndim(operand) > ndim for operand, ndim in zip(operands, own, strict=True)):
-        return bound(equation, operands)
-    operands = [_with_axis(operand, ndim, size) for operand, ndim in zip(operands, own, strict=True)]
-    if name in BY_ELEMENT.split():
-        # A scalar may meet an array.
-        shape = (*equation.outvars[0].aval.shape, size)
-        return bound(equation, [jnp.broadcast_to(operand, shape) for operand in operands])
-    if name in UNCHANGED:
-        return bound(equation, operands)
-    if name == "dot_general":
-        left, right, summed = factors(operands[0], operands[1], params["dimension_numbers"], inner=1)
+    kinds = [atom.aval for atom in equation.invars]
+    axes = [-1 if jnp.ndim(operand) > kind.ndim else None for operand, kind in zip(operands, kinds, strict=True)]
+    if equation.primitive.name in ("jit", "pjit") or set(axes) <= {None}:
+        return _spelled_out(equation, operands)
+    if equation.primitive.name == "dot_general":
+        left, right, summed = factors(*map(_with_axis, operands, kinds), equation.params["dimension_numbers"], inner=1)
         return [jnp.sum(left * right, axis=summed)]
-    if name in MOVES and name != "pad":
-        return [MOVES[name](equation, *operands)]
-    raise TooLarge(name)
+    return jax.vmap(lambda *operands: bound(equation, operands), in_axes=axes, out_axes=-1)(*operands)
 
 
 # Users' objects, such as laws and surfaces, whose methods are written for a single run and evaluated in every lane.

@@ -242,11 +242,14 @@ class PerRide(eqx.Module):
         arrays, static = eqx.partition(controls, eqx.is_inexact_array)
         if sum(leaf.size for leaf in jax.tree.leaves(arrays)) > MOST_ELEMENTS:
             return cls(controls, False)
-        of_ride = spelled_out(lambda arrays, moving: eqx.combine(arrays, static)(*moving))
-        many = jax.tree.map(lambda leaf: leaf[..., None], (arrays, (t, motion)))
+
+        def of_ride(arrays: PyTree[Array], moving: Any) -> Any:
+            return eqx.combine(arrays, static)(*moving)
+
+        example = (arrays, (t, motion))
         with contextlib.suppress(TooLarge):
-            jax.eval_shape(lambda parts: cls(eqx.combine(parts[0], static), True)(*parts[1]), many)
-            return cls(controls, is_elementary(of_ride, arrays, (t, motion)))
+            jax.eval_shape(by_components(of_ride, *example), *example)
+            return cls(controls, is_elementary(spelled_out(of_ride), *example))
         return cls(controls, False)
 
     def of_cells(self, cells: int) -> "PerRide":
@@ -259,31 +262,16 @@ class PerRide(eqx.Module):
         return PerRide(jax.tree.map(spread, self.function), self.by_elements)
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        leaves, structure = jax.tree.flatten((t, motion))
-        leaves = jnp.broadcast_arrays(*leaves)
-        if leaves[0].ndim == 0:
+        shape = np.broadcast_shapes(*map(jnp.shape, jax.tree.leaves((t, motion))))
+        if shape == ():
             return self.function(t, motion)
-        moving = jax.tree.unflatten(structure, leaves)
+        moving = jax.tree.map(lambda part: jnp.broadcast_to(part, shape), (t, motion))
         arrays, static = eqx.partition(self.function, eqx.is_inexact_array)
 
         def of_ride(arrays: PyTree[Array], moving: Any) -> Any:
-            return tuple(eqx.combine(joined(arrays), static)(*moving))
+            return tuple(eqx.combine(arrays, static)(*moving))
 
-        def split(array: Array) -> Array | Numbers:
-            """An array as vectors of rides, one for each of its numbers."""
-            if array.ndim == 0:
-                return array
-            flat = array.reshape(-1, array.shape[-1])
-            # The derivative of this operation joins all numbers at once.
-            return Numbers(tuple(row[0] for row in jax.lax.split(flat, (1,) * len(flat))), array.shape[:-1])
-
-        if self.by_elements:
-            parts = (jax.tree.map(split, arrays), moving)
-            scalars = jax.tree.map(lambda part: jax.ShapeDtypeStruct((), part.dtype), parts)
-            results = by_components(of_ride, *scalars)(*parts)
-            return jax.tree.map(lambda part: jnp.broadcast_to(part, leaves[0].shape), results)
         own = jax.tree.map(lambda part: jax.ShapeDtypeStruct(part.shape[:-1], part.dtype), (arrays, moving))
-        with contextlib.suppress(TooLarge):
-            return over_last_axis(of_ride, *own)(arrays, moving)
-        axes = jax.tree.map(lambda array: -1 if array.ndim else None, arrays)
-        return jax.vmap(of_ride, in_axes=(axes, 0))(arrays, moving)
+        over_rides = by_components if self.by_elements else over_last_axis
+        results = over_rides(of_ride, *own)(arrays, moving)
+        return jax.tree.map(lambda part: jnp.broadcast_to(part, shape), results)

@@ -9,7 +9,6 @@ Source: Bonnesen and Fenchel, Theorie der konvexen Koerper (1934), section 15.
 """
 
 import abc
-import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.compilation.components import TooLarge, by_components
+from nonholonomic.compilation.components import over_lanes
 from nonholonomic.compilation.tracing import with_own_numbers
 from nonholonomic.compilation.xla_cpu import stored
 from nonholonomic.geometry import AbstractFrame, Component, FrameMotion, Place, PlaneFrame, Tangent, Vector
@@ -387,13 +386,7 @@ class RigidBody(AbstractRigidBody):
             place, change = jax.jvp(jax.grad(extended), (jnp.stack(direction),), (jnp.stack(rate),))
             return tuple(place), tuple(change)
 
-        numbers = (leaves, *(scale(-1.0, vector) for vector in (normal, rate)))
-        scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
-        with contextlib.suppress(TooLarge):
-            return by_components(of_one, *jax.tree.map(lambda _: scalar, numbers))(*numbers)
-        if all(jnp.ndim(number) == 0 for number in jax.tree.leaves(numbers)):
-            return of_one(*numbers)
-        return jax.vmap(of_one, in_axes=jax.tree.map(lambda number: 0 if jnp.ndim(number) else None, numbers))(*numbers)
+        return over_lanes(of_one, leaves, *(scale(-1.0, vector) for vector in (normal, rate)))
 
 
 class Plain(eqx.Module):
