@@ -19,7 +19,7 @@ import uuid
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -224,16 +224,12 @@ def _place(folder: Path, facts: object) -> Path:
             versions.append(f"{package} {version(package)}")
     state = (facts, versions, machine, sorted(settings.values.items()))
     digest = hashlib.sha256(repr(state).encode())
-    for path in sorted(_sources()):
-        digest.update(path.read_bytes())
+    # The packages that were installed with this file.
+    packages = [Path(__file__).parents[2] / name for name in ("nonholonomic", "tippe", "stroller")]
+    for path in sorted(path for package in packages for path in package.rglob("*")):
+        if path.suffix in (".py", ".js", ".html"):
+            digest.update(path.read_bytes())
     return folder / f"files-{digest.hexdigest()[:32]}"
-
-
-def _sources() -> Iterator[Path]:
-    """The sources of the packages that were installed with this file."""
-    root = Path(__file__).parents[2]
-    for package in ("nonholonomic", "tippe", "stroller"):
-        yield from (path for kind in ("py", "js", "html") for path in (root / package).rglob(f"*.{kind}"))
 
 
 # Keep the number of compiled programs small: one program for many sizes, and none kept until memory is exhausted.

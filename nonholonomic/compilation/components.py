@@ -393,7 +393,7 @@ def spelled_out(function: Function) -> Function:
     return evaluated
 
 
-def _spelled_out(equation: Equation, inputs: list[ArrayLike]) -> Sequence[ArrayLike] | Program:
+def _spelled_out(equation: Equation, inputs: Sequence[ArrayLike]) -> Sequence[Array] | Program:
     name, params = equation.primitive.name, equation.params
     if name in ("jit", "pjit"):
         return params["jaxpr"]
@@ -463,7 +463,8 @@ def _applied(equation: Equation, operands: list[Array]) -> Sequence[Array] | Pro
     if equation.primitive.name in ("jit", "pjit") or set(axes) <= {None}:
         return _spelled_out(equation, operands)
     if equation.primitive.name == "dot_general":
-        left, right, summed = factors(*map(_with_axis, operands, kinds), equation.params["dimension_numbers"], inner=1)
+        left, right = map(_with_axis, operands, kinds)
+        left, right, summed = factors(left, right, equation.params["dimension_numbers"], inner=1)
         return [jnp.sum(left * right, axis=summed)]
     return jax.vmap(lambda *operands: bound(equation, operands), in_axes=axes, out_axes=-1)(*operands)
 

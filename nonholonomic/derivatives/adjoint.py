@@ -105,7 +105,7 @@ class Checkpoints(NamedTuple):
         end = jnp.minimum(self.depth, SLOTS - 1)
         indices = jnp.where(shifts, jnp.roll(self.index, -1), self.index).at[end].set(index)
         slots = jnp.where(shifts, jnp.roll(self.slot, -1), self.slot).at[end].set(free)
-        room = jax.tree.map(functools.partial(written_in_place, at=free), self.periods, period)
+        room = written_in_place(self.periods, period, at=free)
         return Checkpoints(jnp.minimum(self.depth + 1, SLOTS), indices, slots, room)
 
 

@@ -251,9 +251,6 @@ class VariationalProblem(AbstractDerivedProblem):
             [values, *(change(*direction) for direction in zip(self.tangents, variations, strict=True))]
         )
 
-    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
-        return self.parts(state)[0]
-
     def across_jump(self, time: Lanes, state: States) -> States:
         point, *variations = self.parts(state)
         if not variations:
@@ -361,9 +358,6 @@ class VariedProblem(AbstractDerivedProblem):
         growth = jnp.sum(w * carried, axis=0) / jnp.sum(w * w, axis=0)
         return jnp.concatenate([rate, carried - growth * w, growth[None]])
 
-    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
-        return state[: len(self.magnitudes)]
-
 
 def probed(problem: AbstractProblem) -> VariedProblem:
     """A run and a generic tangent, for derivatives that do not take part in step-size control. The generic tangent does
@@ -403,9 +397,6 @@ class FramedProblem(AbstractDerivedProblem):
         point, *tangents = (state[k : k + size] for k in range(0, len(state), size))
         rate, carried = jax.linearize(lambda point: self.problem.field(time, point), jnp.asarray(point))
         return jnp.concatenate([rate, *map(carried, tangents)])
-
-    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
-        return state[: len(self.magnitudes)]
 
     def clock(self, time: Lanes) -> Lanes:
         return time + self.begin

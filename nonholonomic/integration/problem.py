@@ -230,16 +230,17 @@ class AbstractProblem(eqx.Module):
 
 
 class AbstractDerivedProblem(AbstractProblem):
-    """A problem with more or fewer components than another one, which decides where its runs end and jump."""
+    """A problem with other components than another one, often with more behind those, which decides where its runs end and
+    jump."""
 
     #: Whether runs end on the event of the other problem.
     ends_on_event = True
 
     problem: eqx.AbstractVar[AbstractProblem]
 
-    @abc.abstractmethod
     def inner(self, state: States) -> Float[Array, "inner *lanes"]:
-        """The state of the other problem."""
+        """The state of the other problem, which is the leading part by default."""
+        return state[: len(self.problem.start()[0])]
 
     def clock(self, time: Lanes) -> Lanes:
         """The time of the other problem."""
@@ -729,6 +730,3 @@ class ExtendedProblem(AbstractDerivedProblem, Generic[Core]):
     def field(self, time: Lanes, state: States) -> States:
         core = self.inner(state)
         return self.passive.rates(self.problem, time, core, state[len(core) :])
-
-    def inner(self, state: States) -> Float[Array, "inner *lanes"]:
-        return state[: len(state) - len(self.values)]

@@ -19,7 +19,7 @@ from ..compilation.xla_cpu import written_in_place
 from .problem import FAILED, REACHED_END, RUNNING, AbstractProblem, Settings
 from .runge_kutta import AbstractTunedPair, Integers, Lanes, Mask, States, weighted_sum
 from .scheduler import InLanes, LaneScheduler, Outcome, Recorder
-from .step import LaneState, before_jump, length_to_try, past_jump, trial_step, try_step, until_jump
+from .step import LaneState, after_step, trial_step, until_jump
 
 # The times at which the cells of a problem are sampled, and the samples so far.
 
@@ -263,9 +263,7 @@ class DenseSampleRecorder(SampleRecorder):
         furthest_time = self.times.time_of(record.sample + MAX_SAMPLES_IN_STEP - 1, lane_state)
         lane_state = lane_state._replace(length=jnp.minimum(lane_state.length, furthest_time - lane_state.time))
         length, trial = trial_step(problem, control, lane_state)
-        near = until_jump(problem, control, lane_state)
-        near_lanes = before_jump(problem, near, atol, lane_state, length, trial)
-        new_lanes = past_jump(problem, control, near, lane_state, near_lanes)
+        new_lanes = after_step(problem, control, atol, lane_state, length, trial)
         length = stop_gradient(length)
         end_time = lane_state.time + length
         second = second_derivative(problem, length, end_time, trial.state, trial.rate)
@@ -279,14 +277,14 @@ class DenseSampleRecorder(SampleRecorder):
             is_sample = record.sample_time <= last_time
             state = states_inside((record.sample_time - lane_state.time) / length)
             entry = Rows(state, jnp.where(is_sample, record.sample, len(self.times)))
-            rows = jax.tree.map(functools.partial(written_in_place, at=record.filled), record.rows, entry)
+            rows = written_in_place(record.rows, entry, at=record.filled)
             sample = record.sample + is_sample
             return DenseRecord(record.second, sample, self.times.time_of(sample, new_lanes), rows, record.filled + 1)
 
         # The samples up to `last_time` are all inside this step.
         record = jax.lax.while_loop(lambda record: jnp.any(record.sample_time <= last_time), add, record)
-        if new_lanes is not near_lanes:
-            has_jumped = new_lanes.time > near_lanes.time
+        if problem.jumps(new_lanes.time, new_lanes.state) is not None:
+            has_jumped = new_lanes.time > end_time
             of_far_side = second_derivative(problem, length, new_lanes.time, new_lanes.state, new_lanes.rate)
             second = jnp.where(has_jumped, of_far_side, second)
         return new_lanes, record._replace(second=jnp.where(has_moved, second, record.second))
@@ -320,14 +318,12 @@ def recorded_step(
     of the index of the sample on which each step ended, or the number of samples, that returns what to keep.
     """
     problem, control, atol = in_lanes
-
-    def with_row(row: PyTree) -> PyTree:
-        return jax.tree.map(functools.partial(written_in_place, at=iteration), record.rows, row)
-
     if times is None:
-        new_lanes = try_step(problem, control, atol, lane_state)
-        row = entry(new_lanes, length_to_try(problem, control, lane_state), None)
-        return new_lanes, record._replace(rows=with_row(row))
+        length, trial = trial_step(problem, control, lane_state)
+        new_lanes = after_step(problem, control, atol, lane_state, length, trial)
+        return new_lanes, record._replace(
+            rows=written_in_place(record.rows, entry(new_lanes, length, None), at=iteration)
+        )
     next_time = times.time_of(record.sample, lane_state)
     control_to_target = control._replace(t1=jnp.minimum(next_time, control.t1))
     # Even lengths up to the sample or, if it comes first, to the jump.
@@ -339,14 +335,15 @@ def recorded_step(
     even_length = jnp.where(lane_state.bracketing, length, fitting)
     # The step after a rejected step is shorter on purpose, because it may have to end on a minimum of a margin.
     lane_state = lane_state._replace(length=jnp.where(record.accepted, even_length, jnp.minimum(even_length, length)))
-    new_lanes = try_step(problem, control_to_target, atol, lane_state)
+    length, trial = trial_step(problem, control_to_target, lane_state)
+    new_lanes = after_step(problem, control_to_target, atol, lane_state, length, trial)
     at_target = (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END)
     goes_on = at_target & (new_lanes.time < control.t1)
     status = jnp.where(new_lanes.steps < control.max_steps, RUNNING, FAILED)
     new_lanes = new_lanes._replace(status=jnp.where(goes_on, status, new_lanes.status))
-    tried_length = length_to_try(problem, control_to_target, lane_state)
     is_sample = at_target & (new_lanes.time >= next_time)
-    rows = with_row(entry(new_lanes, tried_length, jnp.where(is_sample, record.sample, len(times))))
+    row = entry(new_lanes, length, jnp.where(is_sample, record.sample, len(times)))
+    rows = written_in_place(record.rows, row, at=iteration)
     return new_lanes, Record(new_lanes.time > lane_state.time, record.sample + is_sample, rows)
 
 

@@ -147,9 +147,8 @@ def past_jump(
     of_near_side = (new_lanes.state, new_lanes.rate, new_lanes.margin, new_lanes.margins)
     state, rate, margin, margins = jax.lax.cond(jnp.any(landed), moved, lambda: of_near_side)
     time, hit = jnp.where(landed, far, new_lanes.time), landed & (margin <= 0.0)
-    far_end = Step(state, rate, rate, margin, margin, None if margins is None else margins[None], (), state, None)
     lanes = new_lanes._replace(status=jnp.where(landed, RUNNING, new_lanes.status))
-    status, side, first, latest_crossing = _classify(problem, control, lanes, far_end, time, hit)
+    status, side, first, latest_crossing = _classify(problem, control, lanes, time, state, margins, hit)
     failed = landed & ~hit & (new_lanes.steps >= control.max_steps)
     status = jnp.where(landed & ~hit & (time >= control.t1), REACHED_END, jnp.where(failed, FAILED, status))
     return new_lanes._replace(
@@ -255,7 +254,8 @@ def before_jump(
     length = length if longest is None else jnp.where(accurate, jnp.minimum(length, longest), length)
     length = jnp.where(crosses_inside, tried_length * negative, length)
     length = jnp.where(bracketing, guess, jnp.where(hit, bracket.stride, length))
-    status, side, first, latest_crossing = _classify(problem, control, lane_state, trial, time, hit)
+    margins = None if trial.margins is None else stop_gradient(trial.margins[-1])
+    status, side, first, latest_crossing = _classify(problem, control, lane_state, time, trial.state, margins, hit)
     ended = running & (status == RUNNING) & moved & (time >= control.t1)
     steps = lane_state.steps + running
     # Written so that a NaN length counts as stuck.
@@ -274,9 +274,7 @@ def before_jump(
         side=side,
         # Just past a crossing the margin is round-off of either sign.
         margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, lane_state.margin)),
-        margins=None
-        if trial.margins is None or lane_state.margins is None
-        else jnp.where(moved, stop_gradient(trial.margins[-1]), lane_state.margins),
+        margins=jax.tree.map(functools.partial(jnp.where, moved), margins, lane_state.margins),
         first_crossing=first,
         crossing_time=latest_crossing,
         bracketing=bracketing,
@@ -289,16 +287,21 @@ def before_jump(
 
 
 def _classify(
-    problem: AbstractProblem, control: Control, lane_state: LaneState, trial: Step, time: Lanes, hit: Mask
+    problem: AbstractProblem,
+    control: Control,
+    lane_state: LaneState,
+    time: Lanes,
+    state: States,
+    margins: Float[Array, "margins *lanes"] | None,
+    hit: Mask,
 ) -> tuple[Integers, Lanes, Lanes, Lanes]:
-    """Status, side, first and latest crossing time of the lanes, where `hit` marks the lanes in which an event was
-    located."""
-    crossing, margins = problem.event_function(trial.state), trial.margins
+    """Status, side, first and latest crossing time of the lanes at this time, where `hit` marks the lanes in which an event
+    was located."""
+    crossing = problem.event_function(state)
     # The located event belongs to the lesser of the margins and the event function, whose sign may be round-off.
     by_margin = hit
     if crossing is not None:
-        least = None if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0)
-        by_margin = hit & (False if least is None else least <= lane_state.side * crossing)
+        by_margin = hit & (False if margins is None else jnp.min(margins, axis=0) <= lane_state.side * crossing)
     crossed = hit & ~by_margin
     if not control.nonterminal:
         status = jnp.where(hit, jnp.where(by_margin, LEFT_DOMAIN, CROSSED), lane_state.status)
@@ -310,7 +313,7 @@ def _classify(
         return status, side, lane_state.first_crossing, lane_state.crossing_time
     # Only a crossing from positive to negative is the event; the return does not count.
     counts = crossed & (lane_state.side > 0.0)
-    time_of_crossing = crossing_time(problem, time, trial.state)
+    time_of_crossing = crossing_time(problem, time, state)
     first = jnp.where(counts & jnp.isinf(lane_state.first_crossing), time_of_crossing, lane_state.first_crossing)
     latest_crossing = jnp.where(counts, time_of_crossing, lane_state.crossing_time)
     status = jnp.where(by_margin, LEFT_DOMAIN, lane_state.status)

@@ -87,7 +87,7 @@ class CrossingRecorder(Recorder):
         state = new.state + (new.crossing_time - new.time) * new.rate
         row = jnp.concatenate([state, new.crossing_time[None]])
         place = jnp.where(crosses, place_of(counted, self.skip, self.count), self.count)
-        rows, places = written_in_place(rows, row, at=iteration), written_in_place(places, place, at=iteration)
+        rows, places = written_in_place((rows, places), (row, place), at=iteration)
         is_last = crosses & (counted >= self.skip + self.count) & (new.status == RUNNING)
         return new._replace(status=jnp.where(is_last, CROSSED, new.status)), (counted, rows, places)
 

@@ -17,7 +17,7 @@ from jax.extend.core import Literal
 from jaxtyping import Array
 
 from .. import sweeps
-from ..compilation.xla_cpu import opened, programs_in
+from ..compilation.xla_cpu import programs_in
 from ..integration import Settings
 from ..integration.problem import DEFAULT_MAX_STEPS, Status, require_times
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
@@ -72,8 +72,8 @@ def checksum_of(model: AbstractModel) -> str:
     checksum = hashlib.sha256(ADDRESS.sub("", str(program)).encode())
     # The text of a program does not show all digits of the constants.
     for inner in programs_in(program):
-        jaxpr, parts = opened(inner)
-        for equation in jaxpr.eqns:
+        parts = getattr(inner, "consts", ())
+        for equation in inner.eqns:
             literals = [operand.val for operand in equation.invars if isinstance(operand, Literal)]
             parts = [*parts, *literals, *jax.tree.leaves(list(equation.params.values()))]
         for array in (np.asarray(part) for part in parts if isinstance(part, Array | np.ndarray | np.generic)):

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..compilation.components import AbstractScalarReader, rows_along
-from ..compilation.xla_cpu import Equation, Program, called_program, opened, programs_of, traced
+from ..compilation.xla_cpu import Equation, Program, called_program, programs_of, traced
 from ..hybrid import MOST_ROUNDS, AbstractBatchedMode, AbstractHoppingMode, HybridOutcome
 from ..hybrid.ensemble import after_reset, after_solve, at_start, mode_numbered, program_groups
 from ..integration import AbstractProblem, Lanes, LaneState, Settings, explicit_tableau
@@ -295,7 +295,7 @@ class _Block(AbstractScalarReader):
             first, count, _ = map(len, counts["ft_in"].unpack())
         constants, carry, rows = inputs[:first], inputs[first : first + count], inputs[first + count :]
         unrolled = length <= WRITTEN_OUT and length * _statements(jaxpr) <= MOST_STATEMENTS
-        if not rows and len(opened(jaxpr)[0].outvars) == count and not unrolled:
+        if not rows and len(jaxpr.outvars) == count and not unrolled:
             head = f"for (let k = 0; k < {length}; k++)"
             return self.loop(head, carry, lambda block, carry: block.read(jaxpr, [*constants, *carry]))
         rows_of_steps: list[Any] = [None] * length
@@ -329,7 +329,7 @@ def _flat(values: Sequence[Value]) -> list[Number]:
 def _statements(jaxpr: Any) -> int:
     """About how many statements a jaxpr takes: one for each number that it computes."""
     total = 0
-    for equation in opened(jaxpr)[0].eqns:
+    for equation in jaxpr.eqns:
         inner = programs_of(equation)
         results: list[Any] = [atom.aval for atom in equation.outvars]
         numbers = sum(math.prod(result.shape) for result in results)
