@@ -25,6 +25,7 @@ from .xla_cpu import (
     programs_of,
     read_program,
     traced,
+    with_constants_first,
 )
 
 #: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with other operations,
@@ -77,9 +78,7 @@ def with_own_numbers(event: Function, *args: PyTree) -> Function:
     contains these numbers. An event without numbers of its own has `TracedFunction`s in place of its functions."""
     closed, shape = jax.make_jaxpr(event, return_shape=True)(*args)
     if any(is_traced(const) for const in closed.consts):
-        # The constants become the first arguments.
-        inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
-        program = ClosedJaxpr(closed.jaxpr.replace(constvars=[], invars=inputs), ())
+        program = with_constants_first(closed)
 
         def evaluated(*args: PyTree) -> PyTree:
             results = jaxpr_as_fun(program)(*jax.tree.leaves(args))

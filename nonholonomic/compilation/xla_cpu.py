@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, Var, jaxpr_as_fun
 from jax.interpreters import mlir, partial_eval
@@ -47,6 +46,12 @@ def traced(function: Function, *arguments: PyTree) -> tuple[ClosedJaxpr, PyTree]
     if getattr(program, "is_high", False):
         program = partial_eval.lower_jaxpr2(program)  # pyright: ignore[reportAttributeAccessIssue]
     return program, shape
+
+
+def with_constants_first(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The program of a function whose first arguments are the values that it closes over."""
+    inputs = [*program.jaxpr.constvars, *program.jaxpr.invars]
+    return ClosedJaxpr(program.jaxpr.replace(constvars=[], invars=inputs), ())
 
 
 def traced_once(function: Function, *examples: PyTree) -> Function:
@@ -189,11 +194,11 @@ def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
     makes the top's field 1.2 times as fast. It also gives all readers the same value: two kernels may round
     differently. It can be removed when XLA's fusion counts what it repeats.
     """
-    present = [value for value in values if value is not None]
+    present, structure = jax.tree.flatten(values)
     if not present:
         return values
-    joined = iter(jnp.unstack(jax.lax.optimization_barrier(jnp.stack(jnp.broadcast_arrays(*present)))))
-    return tuple(None if value is None else next(joined) for value in values)
+    joined = jax.lax.optimization_barrier(jnp.stack(jnp.broadcast_arrays(*present)))
+    return jax.tree.unflatten(structure, jnp.unstack(joined))
 
 
 @jax.custom_jvp
@@ -281,15 +286,6 @@ def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     return result
 
 
-def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ...]:
-    """NumPy arrays as JAX arrays, without compiling.
-
-    Since JAX 0.10, `jnp.asarray` compiles a copy for every new shape, which takes 30 ms. Not for traced numbers. This
-    can be removed when `jnp.asarray` only copies.
-    """
-    return tuple(jax.device_put(np.asarray(array, dtype=float)) for array in arrays)
-
-
 def in_one_kernel(function: Function) -> Function:
     """A function of a tree of arrays that XLA compiles, on a CPU, into a single kernel.
 
@@ -314,9 +310,7 @@ def in_one_kernel(function: Function) -> Function:
             closed, shape = traced(function, argument)
         if not operations(closed).isdisjoint(OUTSIDE_KERNELS.split()):
             return function(argument)
-        # The values that the function closes over become its first arguments.
-        inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
-        program = closed.jaxpr.replace(constvars=[], invars=inputs)
+        program = with_constants_first(closed).jaxpr
         results = _kernel.bind(*closed.consts, *jax.tree.leaves(argument), program=program, context=context)
         return jax.tree.unflatten(jax.tree.structure(shape), results)
 
@@ -401,8 +395,7 @@ mlir.register_lowering(_kernel, mlir.lower_fun(_called_as_one, multiple_results=
 
 def _knows_the_attributes() -> bool:
     """Whether the kernel attributes are known to help: they were tested with jaxlib 0.10 to 0.12."""
-    minor = int(jaxlib_version.split(".")[1])
-    if jaxlib_version.startswith("0.") and 10 <= minor <= 12:
+    if jaxlib_version.startswith(("0.10.", "0.11.", "0.12.")):
         return True
     warn(
         f"loops are compiled without XLA's kernel attributes, which are tested with jaxlib 0.10 to 0.12, but not with "

@@ -388,11 +388,10 @@ def follow(
     time, end, length = jnp.asarray(0.0, float), jnp.asarray(t1, float), jnp.asarray(FIRST_STEP, float)
     state, scales, margin = _start(problem, time)
     times, states, segments = [np.zeros(1)], [np.asarray(state)[:, None]], []
-    accepted, rejected, lost, failed = 0, 0, False, False
+    accepted, rejected, failed = 0, 0, False
+    lost = margin is not None and float(margin) <= 0.0
     # The program is compiled for this number of steps, so it must not change with the number that is left.
     piece_settings = dataclasses.replace(settings, max_steps=min(piece, settings.max_steps))
-    if margin is not None and float(margin) <= 0.0:
-        return DenseSolution(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
         solution, brackets = _piece(
             problem, time, end, length, state, scales, piece_settings, dense, margin is not None
@@ -412,7 +411,6 @@ def follow(
             ys[:, -1] = np.asarray(_evaluate(solution, ts[-1:]))[0]
         # Round-off differs between programs: a loss that only Diffrax has seen is at the end of its last step.
         lost = lost or bool(solution.result == diffrax.RESULTS.event_occurred)
-        failed = (steps == 0 and not lost) or not finite.all()
         valid_steps = int(finite.sum()) if finite.all() else int(np.argmin(finite))
         times.append(ts[:valid_steps])
         states.append(ys[:, :valid_steps])
@@ -420,8 +418,9 @@ def follow(
         if valid_steps:
             length = jnp.asarray(ts[-1] - (ts[-2] if valid_steps > 1 else float(time)))
             time, state = jnp.asarray(ts[valid_steps - 1]), jnp.asarray(ys[:, valid_steps - 1])
-        failed = failed or (not lost and bool(solution.result == diffrax.RESULTS.dt_min_reached))
-        failed = failed or (not lost and float(time) < t1 and accepted + rejected >= settings.max_steps)
+        is_stuck = steps == 0 or bool(solution.result == diffrax.RESULTS.dt_min_reached)
+        is_stuck = is_stuck or (float(time) < t1 and accepted + rejected >= settings.max_steps)
+        failed = not finite.all() or (is_stuck and not lost)
     return DenseSolution(
         np.concatenate(times), np.concatenate(states, axis=1), segments, lost, failed, accepted, rejected
     )

@@ -102,15 +102,15 @@ class Jumps(NamedTuple):
         near = jnp.min(jnp.where((self.ahead > least) & (self.ahead < most), self.ahead, jnp.inf), axis=0)
         return jnp.where(jnp.isfinite(near), near, jnp.nan)
 
-    def sides(self, time: Lanes) -> tuple[Mask, Lanes, Lanes, Lanes]:
-        """The jump whose near side is this time: a mask of the lanes that have one, its near side, its time, which is
-        differentiable, and its far side; all three are the time itself where there is none."""
+    def sides(self, time: Lanes) -> tuple[Mask, Lanes, Lanes]:
+        """The jump whose near side is this time: a mask of the lanes that have one, its time, which is differentiable, and its
+        far side; both are the time itself where there is none."""
         distance = self.ahead - time
         is_near = jnp.abs(distance) <= 0.25 * self.gaps
         is_jump = jnp.any(is_near, axis=0)
         jump = jnp.sum(jnp.where(is_near, self.times, 0.0), axis=0) / jnp.maximum(jnp.sum(is_near, axis=0), 1)
         past = jnp.max(jnp.where(jnp.abs(distance) <= CLUSTER * self.gaps, self.past, -jnp.inf), axis=0)
-        return is_jump, time, jnp.where(is_jump, jump, time), jnp.where(is_jump, past, time)
+        return is_jump, jnp.where(is_jump, jump, time), jnp.where(is_jump, past, time)
 
 
 # The interface of an initial value problem with an event and a domain.
@@ -199,7 +199,8 @@ class AbstractProblem(eqx.Module):
         jumps = self.jumps(time, state)
         if jumps is None:
             return state
-        _, near, jump, far = jumps.sides(stop_gradient(time))
+        near = stop_gradient(time)
+        _, jump, far = jumps.sides(near)
         first, second, none = jump - near, far - jump, jnp.zeros_like(near)
         # After the jump, every time is that of a point beyond it, because the state may contain a clock.
         times = jnp.stack([near, near + 0.5 * first, far, far - 0.5 * second])
@@ -352,7 +353,7 @@ def time_at_jump(problem: AbstractProblem, time: Lanes, state: States, otherwise
     if jumps is None:
         return otherwise
     near = jumps.before(time)
-    is_jump, _, jump, _ = jumps.sides(jnp.where(jnp.isfinite(near), near, time))
+    is_jump, jump, _ = jumps.sides(jnp.where(jnp.isfinite(near), near, time))
     return jnp.where(is_jump, jump, otherwise)
 
 

@@ -134,7 +134,7 @@ def past_jump(
     jumps = problem.jumps(new_lanes.time, new_lanes.state)
     if jumps is None:
         return new_lanes
-    is_jump, _, _, far = jumps.sides(new_lanes.time)
+    is_jump, _, far = jumps.sides(new_lanes.time)
     landed = is_jump & (lane_state.status == RUNNING) & (new_lanes.status == REACHED_END) & (near.t1 <= new_lanes.time)
 
     def moved() -> tuple[States, States, Lanes, Float[Array, "margins *lanes"] | None]:

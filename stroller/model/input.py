@@ -14,11 +14,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, Float, PyTree
 
 from nonholonomic.compilation.components import Held, TooLarge, by_components, over_last_axis, spelled_out
 from nonholonomic.compilation.tracing import TracedFunction, in_cells, is_elementary, jumps_of, warn_of_unclear
+from nonholonomic.compilation.xla_cpu import with_constants_first
 from nonholonomic.geometry import Vector
 from nonholonomic.text import Numbers, described, is_users, joined, likely, name_of, shown
 from nonholonomic.validation import Bounded, as_number, is_traced
@@ -207,10 +208,7 @@ class Formula(eqx.Module):
     def of(cls, controls: Any, t: Any, motion: Any) -> "Formula":
         """The formula of a function, with arguments such as these."""
         closed = jax.make_jaxpr(lambda *arguments: tuple(map(as_number, controls(*arguments))))(t, motion)
-        # The arrays become the first arguments.
-        inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
-        program = ClosedJaxpr(closed.jaxpr.replace(constvars=[], invars=inputs), ())
-        return cls(tuple(closed.consts), TracedFunction(controls, program))
+        return cls(tuple(closed.consts), TracedFunction(controls, with_constants_first(closed)))
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         leaves = jnp.broadcast_arrays(*jax.tree.leaves((t, motion)))

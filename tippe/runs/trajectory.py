@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.compilation.xla_cpu import on_device
 from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.hybrid import BETWEEN, MOST_ROUNDS, HybridOutcome, HybridPath, Segment, solve_hybrid_dense
 from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
@@ -130,7 +129,9 @@ class Trajectory(AbstractTrajectory):
 
     def with_rows(self, times: Float[np.ndarray, " times"], rows: Values, mode: Values | None) -> "Trajectory":
         parts = {"t": times, **self.parts_of(self.scene, rows, mode, len(self.start))}
-        return dataclasses.replace(self, **dict(zip(parts, on_device(*parts.values()), strict=True)))
+        # Unlike `jnp.asarray`, this compiles nothing for new shapes.
+        parts = jax.device_put({name: np.asarray(part, dtype=float) for name, part in parts.items()})
+        return dataclasses.replace(self, **parts)
 
 
 # One run through contacts, flights and impacts, with its path.
@@ -380,7 +381,7 @@ def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> A
     impacts ends as "unresolved"."""
     scene, kind, times = model.scene, model.trajectories, path.times
     mode, counts = (path.numbers(times), path.counts) if isinstance(path, HybridPath) else (None, ())
-    end = path.end_time if isinstance(path, HybridPath) and scene.contact == "hybrid" else on_device(times[-1])[0]
+    end = path.end_time if isinstance(path, HybridPath) and scene.contact == "hybrid" else jax.device_put(times[-1])
     rows, start = np.asarray(path.states), scene.state(model.launch)
     if isinstance(path, HybridPath):
         code, state, last_mode = path.status, path.state, path.mode
