@@ -618,11 +618,6 @@ def _equal(a: Bounds, b: Bounds) -> Bounds:
     return Bounds((a.low == b.high) & (a.high == b.low), (a.low <= b.high) & (a.high >= b.low))
 
 
-def _different(a: Bounds, b: Bounds) -> Bounds:
-    equal = _equal(a, b)
-    return Bounds(~equal.high, ~equal.low)
-
-
 RULES: dict[str, Callable[..., Bounds]] = {
     "abs": lambda box: _even(box, jnp.abs),
     "acos": lambda box: Bounds(jnp.arccos(jnp.minimum(box.high, 1.0)), jnp.arccos(jnp.maximum(box.low, -1.0))),
@@ -633,7 +628,7 @@ RULES: dict[str, Callable[..., Bounds]] = {
     "div": _quotient,
     "eq": _equal,
     "mul": _product,
-    "ne": _different,
+    "ne": lambda a, b: Bounds(*(~end for end in reversed(_equal(a, b)))),
     "is_finite": lambda box: Bounds(jnp.isfinite(box.low) & jnp.isfinite(box.high), jnp.ones(box.low.shape, bool)),
     "one_minus_square": lambda box: Bounds(*(1.0 - end for end in reversed(_even(box, jnp.square)))),
     "polynomial": _polynomial,

@@ -244,7 +244,12 @@ def test_files_are_kept_until_their_facts_change(tmp_path, monkeypatch):
         changed.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX")
         assert first(tmp_path, "a") == "file 7"
     with monkeypatch.context() as changed:
-        changed.setattr(cache, "_sources", lambda: [tmp_path / LOOKED_AT])
-        (tmp_path / LOOKED_AT).write_text("source")
+        # Packages that are installed elsewhere, with other sources.
+        sources = tmp_path / "sources"
+        (sources / "nonholonomic" / "compilation").mkdir(parents=True)
+        (sources / "nonholonomic" / "other.py").write_text("source")
+        changed.setattr(cache, "__file__", str(sources / "nonholonomic" / "compilation" / "cache.py"))
         assert first(tmp_path, "a") == "file 8"
+        (sources / "nonholonomic" / "other.py").write_text("another source")
+        assert first(tmp_path, "a") == "file 9"
     assert first(tmp_path, "a") == "file 3"
