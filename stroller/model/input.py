@@ -21,7 +21,7 @@ from nonholonomic.compilation.components import Held, TooLarge, by_components, o
 from nonholonomic.compilation.tracing import TracedFunction, in_cells, is_elementary, jumps_of, warn_of_unclear
 from nonholonomic.compilation.xla_cpu import with_constants_first
 from nonholonomic.geometry import Vector
-from nonholonomic.text import Numbers, described, is_users, joined, likely, name_of, shown
+from nonholonomic.text import described, is_users, likely, name_of, shown
 from nonholonomic.validation import Bounded, as_number, is_traced
 
 
