@@ -90,7 +90,7 @@ def by_components(function: Function, *shapes: PyTree) -> Function:
     return evaluated
 
 
-def _elements(array: Any, own: jax.ShapeDtypeStruct) -> Elements:
+def _elements(array: Array, own: jax.ShapeDtypeStruct) -> Elements:
     """The elements of an array that may have lanes in its last axis, besides its own axes."""
     elements = np.empty(own.shape, object)
     if own.shape == ():
