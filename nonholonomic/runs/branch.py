@@ -25,13 +25,14 @@ from .continuation import (
     CROSSING,
     DIVERGES,
     DOUBLING,
-    ENDS,
+    ILLEGAL,
     OF_A_FAMILY,
     RANK,
     REGULAR,
     STEPS,
     Continuation,
     Point,
+    end_of,
 )
 
 # Only for type checkers: xarray is optional.
@@ -43,21 +44,6 @@ SAME_PERIOD, SMALLEST_SCALE = 1e-9, 1e-9
 
 #: Multipliers nearer to the unit circle than this count as on it.
 ON_CIRCLE = 1e-9
-
-#: Why there is no orbit, by `Orbit.reason`.
-REASONS = (
-    "",
-    "the run from there ends, or does not cross the section again within t1 = {t1:.6g} s{at_rest}",
-    "the return from there ends in another mode than the first",
-    "a return from there still misses it by {residual:.2g}{hint}",
-    "the state is an equilibrium{at_rest}",
-    "the run from there ends before the period",
-    "the integration of the run from there fails",
-    "a reset of the run from there is grazing, and the return map has no derivative",
-    "a reset falls on the end of the period; shift the phase of the drive",
-    "the drive does not repeat after the period; pass period=, that of the drive, in s",
-    "a number is illegal",
-)
 
 
 class Orbit(eqx.Module):
@@ -116,8 +102,9 @@ class Orbit(eqx.Module):
         if np.ndim(self.reason):
             raise ValueError("status is that of a single orbit; the orbits of a batch have `reason`, an array")
         reason = int(self.reason)
-        return "illegal" if reason == len(REASONS) - 1 else "unresolved" if reason else "completed"
+        return "illegal" if reason == ILLEGAL else "unresolved" if reason else "completed"
 
+    @status_line("following a branch")
     def branch(
         self, name: str, until: float, step: float | None = None, points: int = 500, period: Any = None
     ) -> "Branch":
@@ -165,7 +152,14 @@ class Orbit(eqx.Module):
 
         ```
         """
-        return branch_of(self, name, until, step, points, period)
+        require_whole(points, "points", 2)
+        if step is not None:
+            require(step, "step", above=0.0)
+        course, full = continuation_of(self, name, until, period)
+        largest = 1.0 / STEPS if step is None else min(float(step) / abs(course.last - course.first), 0.5)
+        found, kinds, end = course.followed(largest, points)
+        values = jnp.asarray([point.value for point in found])
+        return Branch(full, values, course.orbits(found), tuple(kinds), end, period)
 
     def __repr__(self) -> str:
         if is_traced(self) or np.ndim(self.period):
@@ -292,7 +286,7 @@ class Branch(eqx.Module):
         begin = course.begin
         old = course.corrected(begin, np.eye(len(begin))[-1])
         if isinstance(old, int):
-            raise ValueError(f"the special point is no orbit: {ENDS[old]}")
+            raise ValueError(f"the special point is no orbit: {end_of(old)}")
         if kind == DOUBLING:
             values, vectors = np.linalg.eig(old.jacobian)
             aside = np.append(np.real(vectors[list(orbit.search.free), np.argmin(np.abs(values + 1.0))]), 0.0)
@@ -310,7 +304,7 @@ class Branch(eqx.Module):
             new = course.corrected(begin + distance * aside, aside)
             if not isinstance(new, int):
                 return jax.tree.map(lambda part: part[0], course.orbits([new]))
-        raise ValueError(f"no orbit of the other branch was found near {self.name} = {value:.10g}: {ENDS[int(new)]}")
+        raise ValueError(f"no orbit of the other branch was found near {self.name} = {value:.10g}: {end_of(int(new))}")
 
     def to_table(self) -> Table:
         """The branch as a `Table` over its points: `value`, `period` [s], the components of the state, the real and imaginary
@@ -428,7 +422,7 @@ def continuation_of(
     depends = dependent_outputs(numbers, jnp.zeros(()))
     if len(depends) != len(jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))):
         raise ValueError(f"name = {name!r} is left out in the scene, or 0; give it a value other than 0 there")
-    others = tuple(k for k, is_number in enumerate(depends, 1) if is_number)
+    others = tuple(k for k, is_number in enumerate(depends) if is_number)
     values = {float(orbit.leaves[k]) for k in others}
     if len(values) > 1:
         single = next(own for own in known if own != full and of_all_modes(own) == full)
@@ -457,22 +451,3 @@ def continuation_of(
         )
     new = course.evaluated(course.begin)
     return course._replace(in_motion=bool(new.in_motion)), full
-
-
-@status_line("following a branch")
-def branch_of(
-    orbit: Orbit,
-    name: str,
-    until: float,
-    step: float | None,
-    points: int,
-    period: Callable[[Array], Array] | None,
-) -> Branch:
-    """The branch of an orbit. **Arguments:** as for `Orbit.branch`."""
-    require_whole(points, "points", 2)
-    if step is not None:
-        require(step, "step", above=0.0)
-    course, full = continuation_of(orbit, name, until, period)
-    largest = 1.0 / STEPS if step is None else min(float(step) / abs(course.last - course.first), 0.5)
-    found, kinds, end = course.followed(largest, points)
-    return Branch(full, jnp.asarray([point.value for point in found]), course.orbits(found), tuple(kinds), end, period)

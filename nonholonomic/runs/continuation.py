@@ -25,19 +25,29 @@ if TYPE_CHECKING:
 KINDS = FOLD, DOUBLING, TORUS, CROSSING = "fold", "period doubling", "Neimark-Sacker", "branch point"
 GRAZING, REGULAR = "grazing", "regular"
 
-#: Why a branch ends where a return fails, by `Return.reason`, where the number of resets changes, and where Newton's method
-#: does not converge.
-ENDS = {
-    1: "the run ends, or does not cross the section again within t1",
-    2: "the return ends in another mode than the first",
-    5: "the run ends before the period",
-    6: "the integration fails",
-    7: "a reset is grazing, and the return map has no derivative",
-    8: "a reset falls on the end of the period; shift the phase of the drive",
-    10: "the number of resets in a period changes, so a margin touches zero",
-    11: "Newton's method does not converge, even with the smallest steps",
-}
-CHANGES, DIVERGES = 10, 11
+#: Why there is no orbit, by `Orbit.reason`, or why a branch ends, from the number of resets on; {start} and {run} name the run.
+REASONS = (
+    "",
+    "the run{start} ends, or does not cross the section again within t1{t1}{at_rest}",
+    "the return{start} ends in another mode than the first",
+    "a return{start} still misses it by {residual:.2g}{hint}",
+    "the state is an equilibrium{at_rest}",
+    "the run{start} ends before the period",
+    "the integration{run} fails",
+    "a reset{run} is grazing, and the return map has no derivative",
+    "a reset falls on the end of the period; shift the phase of the drive",
+    "the drive does not repeat after the period; pass period=, that of the drive, in s",
+    "a number is illegal",
+    "the number of resets in a period changes, so a margin touches zero",
+    "Newton's method does not converge, even with the smallest steps",
+)
+ILLEGAL, CHANGES, DIVERGES = 10, 11, 12
+
+
+def end_of(reason: int) -> str:
+    """Why a branch ends, in words."""
+    return REASONS[reason].format(start="", run="", t1="", at_rest="")
+
 
 #: The largest step as a part of the range of the number; the smallest, as a part of the largest.
 STEPS, SMALLEST = 50, 1e-9
@@ -117,7 +127,7 @@ def several_returns(
         moved, shift, falls = search.on_section(leaves, 1, old.state[:, None])
         is_near = in_motion & falls[0] & (jnp.abs(shift[0]) < NEAR * time)
         state = jnp.where(is_near, moved[:, 0], old.state)
-        left = jnp.where(old.reason > 0, 0.0, leaves[0])
+        left = jnp.where(old.reason > 0, 0.0, leaves[search.horizon])
         new = search.returned(search.with_start(leaves, state[:, None]), 1, others, tolerance, left)
         by_state, time_by_state = new.by_state[0], new.time_by_state[0]
         by_number = sum((part[0] for part in new.by_numbers), jnp.zeros_like(state))
@@ -201,7 +211,7 @@ class Continuation(NamedTuple):
             leaves[k] = column
         periods, errors = (np.array(part) for part in ([p.period for p in points], [p.error for p in points]))
         if search.is_driven:
-            leaves[0] = periods / self.returns
+            leaves[search.horizon] = periods / self.returns
         numbers = (periods, states, np.stack([point.multipliers for point in points]), errors, errors)
         iterations, none = np.array([point.iterations for point in points]), np.zeros(count, int)
         counts = (none + int(self.orbit.family), iterations, none)
@@ -225,8 +235,8 @@ class Continuation(NamedTuple):
             leaves[k] = np.asarray(value)
         if self.period is not None:
             horizon, slope = jax.jvp(self.period, (jnp.asarray(value),), (jnp.ones(()),))
-            leaves[0], rate = np.asarray(horizon), float(slope)
-        leaves[0] = leaves[0] * float(periods)
+            leaves[search.horizon], rate = np.asarray(horizon), float(slope)
+        leaves[search.horizon] = leaves[search.horizon] * float(periods)
         state, tolerance = np.array(self.orbit.state), max(float(leaves[-1]) / FINER, TIGHTEST)
         state[list(search.free)] = unknowns[:-1] * self.scale
         time = float(self.orbit.period) / self.orbit.returns
@@ -241,7 +251,7 @@ class Continuation(NamedTuple):
         return new, matrix, np.append(new.start[free] / self.scale, unknowns[-1])
 
     def corrected(self, guess: np.ndarray, tangent: np.ndarray) -> Point | int:
-        """The point of the branch in the hyperplane through a guess across the tangent, or an entry of `ENDS`."""
+        """The point of the branch in the hyperplane through a guess across the tangent, or why there is none."""
         unknowns, tolerance = guess, float(self.orbit.leaves[-1])
         for iteration in range(1, MOST_NEWTON + 1):
             new, matrix, unknowns = self.linearized(unknowns)
@@ -348,7 +358,7 @@ class Continuation(NamedTuple):
             raise ValueError(OF_A_FAMILY)
         start = self.corrected(begin, np.eye(len(begin))[-1])
         if isinstance(start, int):
-            raise ValueError(f"the orbit: there is no branch from {self.first:.10g}: {ENDS[start]}")
+            raise ValueError(f"the orbit: there is no branch from {self.first:.10g}: {end_of(start)}")
         points, kinds, length, is_free = [start], [REGULAR], 0.25 * step, True
         problem = 0
         while len(points) < count:
@@ -362,7 +372,7 @@ class Continuation(NamedTuple):
                 length, is_free = 0.5 * length, False
                 if length < SMALLEST * step:
                     kinds[-1] = GRAZING if problem in (7, CHANGES) else kinds[-1]
-                    return points, kinds, ENDS[problem or DIVERGES]
+                    return points, kinds, end_of(problem or DIVERGES)
                 continue
             for _, test, point in zeros:
                 if test >= len(KINDS):

@@ -502,7 +502,8 @@ _compiled = eqx.filter_jit(time_of_event)
 
 
 class EventTime(AbstractDifferentiableSolve):
-    """Times of the events of cells. The leaves are the numbers of the model, floats first, the horizon and the tolerance.
+    """Times of the events of cells. The leaves are the numbers of the model that are floats, the horizon, the other numbers of
+    the model, and the tolerance.
 
     - `movable`: number of floats of the model; `structures`, `rest`: the model without its numbers; `settings`: without the
       tolerance.
@@ -528,37 +529,49 @@ class EventTime(AbstractDifferentiableSolve):
         numbers, further = (jax.tree.flatten(part) for part in (floats, others))
         structures = (numbers[1], further[1])
         solve = cls(len(numbers[0]), structures, rest, settings.with_tolerance(None), last, unchecked)
-        return (solve, *numbers[0], *further[0], as_number(t1), settings.tolerance)
+        return (solve, *numbers[0], as_number(t1), *further[0], settings.tolerance)
+
+    @property
+    def horizon(self) -> int:
+        """The place of the horizon among the leaves."""
+        return self.structures[0].num_leaves
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isinf(value)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-        is_legal, t1, settings = self.permitted(leaves)
-        ensemble = Ensemble.of(self.model(leaves), cells, settings.tolerance, self.last)
-        outcome = ensemble.solve(t1, cells, settings, traced=True)
-        return self._times(leaves, is_legal, settings, ensemble, outcome, [])[0]
+        return self.value_and_tangents((), False, cells, *leaves)[0]
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         is_legal, t1, settings = self.permitted(leaves)
-        model = self.model(leaves)
-        model.require_differentiable(nested, self.last)
+        model, slopes = self.model(leaves), []
+        if not active:
+            ensemble = Ensemble.of(model, cells, settings.tolerance, self.last)
+            outcome = ensemble.solve(t1, cells, settings, traced=True)
+        else:
+            model.require_differentiable(nested, self.last)
 
-        def build(floats: tuple[Array, ...], cells: int | None) -> Ensemble:
-            assert cells is not None
-            return Ensemble.of(self.model((*floats, *leaves[self.movable :])), cells, settings.tolerance, self.last)
+            def build(floats: tuple[Array, ...], cells: int | None) -> Ensemble:
+                assert cells is not None
+                return Ensemble.of(self.model((*floats, *leaves[self.movable :])), cells, settings.tolerance, self.last)
 
-        # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
-        ensemble, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
-        options = {"traced": True, "one_kernel": not nested}
-        outcome, slopes, _ = ensemble.solve_with_tangents(tangents, t1, cells, settings, **options)
-        return self._times(leaves, is_legal, settings, ensemble, outcome, gather([*slopes]))
+            # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
+            ensemble, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
+            options = {"traced": True, "one_kernel": not nested}
+            outcome, along, _ = ensemble.solve_with_tangents(tangents, t1, cells, settings, **options)
+            slopes = gather([*along])
+        # Infinite and 0 where there is no event, NaN where the run failed.
+        status = status_of(model, ensemble, outcome, settings.tolerance)
+        is_good = is_legal & (status != int(SILENT[0])) & (status != int(SILENT[1]))
+        has_event = status == int(Status.EVENT)
+        time = jnp.where(has_event, outcome.crossing_time, jnp.inf)
+        return nan_unless(is_good, (time, [jnp.where(has_event, slope, 0.0) for slope in slopes]))
 
     def model(self, leaves: Sequence[Array]) -> AbstractModel:
         """The model of the leaves."""
-        parts = zip(self.structures, (leaves[: self.movable], leaves[self.movable : -2]), strict=True)
+        parts = zip(self.structures, (leaves[: self.horizon], leaves[self.horizon + 1 : -1]), strict=True)
         return eqx.combine(*(jax.tree.unflatten(structure, part) for structure, part in parts), self.rest)
 
     def permitted(self, leaves: Sequence[Array]) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
@@ -566,24 +579,7 @@ class EventTime(AbstractDifferentiableSolve):
 
         A batch has one tolerance: the smallest.
         """
-        *_, t1, tolerance = leaves
-        is_legal = jnp.asarray(True)
+        is_legal, t1, tolerance = jnp.asarray(True), leaves[self.horizon], leaves[-1]
         if self.unchecked:
             is_legal, t1, tolerance = legal_run(self.model(leaves).legal(), t1, tolerance)
         return is_legal, t1, self.settings.with_tolerance(jnp.min(tolerance))
-
-    def _times(
-        self,
-        leaves: Sequence[Array],
-        is_legal: Bool[Array, "..."],
-        settings: Settings,
-        ensemble: Ensemble,
-        outcome: Outcome | HybridOutcome,
-        slopes: list[Float[Array, " cells"]],
-    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        """The times and their derivatives: infinite and 0 where there is no event, NaN where the run failed."""
-        status = status_of(self.model(leaves), ensemble, outcome, settings.tolerance)
-        is_good = is_legal & (status != int(SILENT[0])) & (status != int(SILENT[1]))
-        has_event = status == int(Status.EVENT)
-        time = jnp.where(has_event, outcome.crossing_time, jnp.inf)
-        return nan_unless(is_good, (time, [jnp.where(has_event, slope, 0.0) for slope in slopes]))

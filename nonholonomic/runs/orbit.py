@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..compilation.tracing import named_errors, with_own_numbers
-from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, tangent_scale, tangents_by
+from ..derivatives import differentiable_solve, tangent_scale, tangents_by
 from ..geometry.vector import nearest_turn
 from ..hybrid import solve_hybrid
 from ..hybrid.saltation import VariationalMode, along, delay, variational_modes, variational_start
@@ -28,8 +28,8 @@ from ..parameters import Parameters, as_one
 from ..terminal import status_line
 from ..text import described, shown
 from ..validation import as_number, explaining, is_traced, require_outside
-from .branch import REASONS, Orbit
-from .continuation import FINER, NEAR, RANK, SAME_ORBIT
+from .branch import Orbit
+from .continuation import FINER, ILLEGAL, NEAR, RANK, REASONS, SAME_ORBIT
 from .crossings import SAME, on_margin, require_section, section_of
 from .event import Ensemble, EventTime, modes_of
 from .model import AbstractModel, AbstractSceneModel, check_run, model_of, settings_for_lanes
@@ -97,29 +97,27 @@ class Newton(NamedTuple):
     step: Array
 
 
-class OrbitSolve(AbstractDifferentiableSolve):
-    """Periodic orbits of cells. The leaves are those of an `EventTime`, but the horizon, which may be the period, comes first.
+class OrbitSolve(EventTime):
+    """Periodic orbits of cells. The leaves are those of an `EventTime`, in which the horizon, or the period, can move.
 
-    - `movable`: number of movable leaves; `event`: the times of the section.
     - `starts`: the leaves that are components of the start.
     - `is_driven`: whether the period is given; `free`: the components that may change.
     - `with_multipliers`: whether the derivatives of the multipliers are computed.
     """
 
-    movable: int
-    event: EventTime
     starts: tuple[int, ...] = eqx.field(static=True)
     is_driven: bool = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
     with_multipliers: bool = eqx.field(static=True, default=True)
 
     @classmethod
-    def of(cls, model: Any, t1: Array, settings: Settings, *options: Any) -> tuple[Any, ...]:
+    def of_model(cls, model: Any, t1: Array, settings: Settings, *options: Any) -> tuple[Any, ...]:
         """The solve and its leaves. **Arguments:** `options`: the fields from `is_driven` on."""
-        event, *numbers, t1, tolerance = EventTime.of(model, t1, settings, False)
+        timed, *leaves = EventTime.of(model, t1, settings, False)
         of_start = {id(number) for number in model.reduced_start}
-        starts = tuple(k for k, number in enumerate(numbers, 1) if id(number) in of_start)
-        return (cls(1 + event.movable, event, starts, *options), t1, *numbers, tolerance)
+        starts = tuple(k for k, leaf in enumerate(leaves) if id(leaf) in of_start)
+        movable, *rest = (getattr(timed, field.name) for field in dataclasses.fields(timed))
+        return (cls(movable + 1, *rest, starts, *options), *leaves)
 
     def __reduce__(self) -> tuple[type[None], tuple[()]]:
         # A user's classes may not be pickled, but the numbers of an orbit can.
@@ -131,15 +129,6 @@ class OrbitSolve(AbstractDifferentiableSolve):
     def for_parts(self, wanted: tuple[int, ...]) -> "OrbitSolve":
         # The real and the imaginary parts of the multipliers.
         return dataclasses.replace(self, with_multipliers=any(k % PARTS in (2, 3) for k in wanted if k >= PARTS))
-
-    def model(self, leaves: Sequence[Array]) -> AbstractModel:
-        """The model of the leaves."""
-        return self.event.model(self.of_event(leaves))
-
-    def of_event(self, leaves: Sequence[Array]) -> tuple[Array, ...]:
-        """The leaves in the order of the `EventTime`."""
-        t1, *numbers, tolerance = leaves
-        return (*numbers, t1, tolerance)
 
     def with_start(self, leaves: Sequence[Array], state: Float[Array, "components cells"]) -> tuple[Array, ...]:
         """The leaves with other starts."""
@@ -187,7 +176,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
         **Arguments:** `others`: the leaves of the model, apart from the start, along which to differentiate; `left`: horizon
         [s], 0 for cells that are not run.
         """
-        active, settings = (*self.starts, *others), self.event.settings.with_tolerance(tolerance)
+        active, settings = (*self.starts, *others), self.settings.with_tolerance(tolerance)
 
         def build(leaves: tuple[Array, ...], cells: int | None) -> Ensemble:
             assert cells is not None
@@ -281,7 +270,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
 
     def newton(self, cells: int, leaves: tuple[Array, ...], repeats: bool = True) -> Newton:
         """Newton's iteration of all cells, from the starts. **Arguments:** `repeats`: whether a drive should repeat."""
-        is_legal, t1, settings = self.event.permitted(self.of_event(leaves))
+        is_legal, t1, settings = self.permitted(leaves)
         tolerance = settings.tolerance
         finer = jnp.maximum(tolerance / FINER, TIGHTEST)
         size, free = len(self.starts), jnp.asarray(self.free)
@@ -346,7 +335,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
             return jax.tree.map(lambda old, new: jnp.where(verifies, old, new), checked, corrected)
 
         false, zeros, whole = jnp.asarray(False), jnp.zeros(cells), jnp.zeros(cells, int)
-        reason = jnp.where(is_legal, whole, len(REASONS) - 1)
+        reason = jnp.where(is_legal, whole, ILLEGAL)
         matrices = (jnp.zeros((cells, size, size)), jnp.zeros((cells, size)), jnp.zeros((cells, len(self.free), size)))
         of_last = (jnp.zeros(cells, bool), zeros, *matrices, zeros, zeros)
         begin = Newton(jnp.zeros((), int), start, false, false, false, reason, whole, *of_last)
@@ -373,9 +362,9 @@ class OrbitSolve(AbstractDifferentiableSolve):
         if nested:
             raise ValueError("second derivatives of periodic orbits are not available; take differences of a gradient")
         newton, size, free = self.newton(cells, leaves), len(self.starts), jnp.asarray(self.free)
-        others = tuple(k for k in active if k > 0 and k not in self.starts)
+        others = tuple(k for k in active if k != self.horizon and k not in self.starts)
         at_orbit = self.with_start(leaves, newton.state)
-        t1 = jnp.where(newton.reason > 0, 0.0, leaves[0])
+        t1 = jnp.where(newton.reason > 0, 0.0, leaves[self.horizon])
         finer = jnp.maximum(jnp.min(leaves[-1]) / FINER, TIGHTEST)
         last = self.returned(at_orbit, cells, others, finer, t1)
         by_numbers = dict(zip(others, zip(last.by_numbers, last.time_by_numbers, strict=True), strict=True))
@@ -386,7 +375,7 @@ class OrbitSolve(AbstractDifferentiableSolve):
         is_vague = is_family & (distance > SAME_ORBIT * extent)
         for k in active:
             fixed, (by, delay) = zeros, by_numbers.get(k, (zeros, jnp.zeros(cells)))
-            if k == 0 and self.is_driven:
+            if k == self.horizon and self.is_driven:
                 by, delay = last.rate.T, jnp.ones(cells)
             elif k in self.starts:
                 # The start is moved onto the section, and to the nearest orbit of a family.
@@ -596,7 +585,7 @@ def periodic_orbit(
         model = dataclasses.replace(model, symmetry=Parameters.of({"symmetry": mapped}))
     places = tuple(k for k, name in enumerate(names) if free is None or name in free)
     settings = settings_for_lanes(tolerance, solver)
-    search, *leaves = OrbitSolve.of(model, as_number(horizon), settings, period is not None, places)
+    search, *leaves = OrbitSolve.of_model(model, as_number(horizon), settings, period is not None, places)
     time, state, *parts = differentiable_solve(search, *leaves)
     real, imaginary, error, residual, *counts = parts
     family, iterations, reason = (jnp.asarray(count).astype(int) for count in counts)
@@ -606,6 +595,7 @@ def periodic_orbit(
         hint = "" if period is None or model.smooth else "; a reset near the end of the period has such an effect"
         if free is not None:
             hint = "; the components that are not free must be those of an orbit, on the section"
-        why = REASONS[int(reason)].format(t1=t1, residual=float(residual), hint=hint, at_rest=model.at_rest)
+        run = {"start": " from there", "run": " of the run from there", "t1": f" = {t1:.6g} s"}
+        why = REASONS[int(reason)].format(**run, residual=float(residual), hint=hint, at_rest=model.at_rest)
         raise ValueError(f"start: no periodic orbit was found: after {int(iterations)} Newton steps, {why}")
     return orbit
