@@ -27,8 +27,7 @@ from .crossings import crossings
 from .event import UNMEASURED, modes_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, check_run, model_of, settings_for_lanes
 from .simulate import Samples
-from .sweep import Options, named_axes, require_names, table_of
-from .table import TableForm
+from .sweep import Options, require_names, table_of
 
 # Lyapunov exponents: whether nearby runs diverge exponentially, and how fast.
 
@@ -560,8 +559,7 @@ def basins(
     shares = np.sort(np.arange(SAMPLED) * 0.6180339887498949 % 1.0)
     times = 0.25 * float(t1) * (np.arange(4)[:, None] + shares).ravel()
     options = Options(tolerance, solver, max_steps, scattered, False, (), path, progress, executor)
-    samples, named = Ranges(times, tuple(names)), named_axes(model, axes)
-    table = table_of(model, named, float(t1), "first", options, TableForm(), samples=samples, timed=False)
+    table = table_of(model, axes, t1, options, samples=Ranges(times, tuple(names)), timed=False)
     return dataclasses.replace(
         table,
         variables={"attractor": attractors_of(table, tuple(names), resolution, tolerance), **table.variables},

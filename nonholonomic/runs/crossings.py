@@ -4,6 +4,7 @@ A run continues through its crossings and through its resets; nothing starts aga
 lanes, and the resets that cross in the rounds of the modes.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -26,11 +27,10 @@ from ..integration.step import try_step
 from ..sweeps import Axis, Table, Variable
 from ..text import shown
 from ..validation import explaining, require_outside, require_whole
-from .event import modes_of, near_zero, problem_of
+from .event import counted, modes_of, near_zero, problem_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
-from .simulate import Samples, mode_at, own_axis
-from .sweep import Options, named_axes, require_names, table_of
-from .table import TableForm
+from .simulate import Samples, mode_at, nan_where, own_axis
+from .sweep import Options, require_names, table_of
 
 #: A crossing within this fraction of the time in a mode before the end of the mode is at its end: the event function vanishes
 #: with the margin of the mode.
@@ -162,7 +162,7 @@ def crossings_in_cells(
         value, slope, error = near_zero(problem, outcome.end_time, outcome.state)
         is_new = (outcome.status == LEFT_DOMAIN) & (jnp.abs(value) <= error) & (slope < 0.0) & ~crossed_at_end(outcome)
         kept = with_row(kept, is_new, is_new, outcome.end_time, outcome.state, 0)
-        rows, ended, counted = kept.state, outcome, ()
+        rows, ended = kept.state, outcome
     else:
         modes, first, states = modes_of(model, size, settings.tolerance, names, True)
         horizons = jnp.broadcast_to(t1, (size,))
@@ -208,27 +208,23 @@ def crossings_in_cells(
         groups, runs = [(number,) for number in range(len(modes))], at_start(first, states, cells, len(model.counters))
         # As many resets between two crossings as in a run.
         ended, kept = all_rounds((runs, start(len(states))), groups, solve, reset, MOST_ROUNDS * (count + skip))
-        counted = ended.counts
         rows = [over_cells(lambda mode, state: mode.shown(state), mode)(kept.state) for mode in modes]
         rows = jnp.select([kept.mode == number for number in range(len(modes))], rows, jnp.nan)
     status = jnp.where(kept.counted >= skip + count, int(Status.EVENT), model.ended(ended, settings.tolerance))
 
     def read(model: AbstractModel, time: Array, rows: Array, mode: Array) -> dict[str, Array]:
-        values = model.read(names, time, rows, None if model.smooth else mode_at(mode))
-        is_kept = jnp.isfinite(time)
-        return {
-            name: jnp.where(is_kept.reshape(-1, *[1] * (part.ndim - 1)), part, jnp.nan) for name, part in values.items()
-        }
+        return nan_where(~jnp.isfinite(time), model.read(names, time, rows, None if model.smooth else mode_at(mode)))
 
     values = eqx.filter_vmap(read, in_axes=(own_axis, -1, -1, -1))(model, kept.time, rows, kept.mode)
-    counts = {"steps": ended.steps, "rejected": ended.rejected} | dict(zip(model.counters, counted, strict=True))
-    return status, {"time": kept.time.T, "end_time": ended.end_time} | values | counts
+    return status, {"time": kept.time.T} | values | counted(model, ended)
 
 
+@dataclasses.dataclass(frozen=True)
 class Crossings(Samples):
-    """The crossings in a table: their numbers, counted from 1, in place of times; and the names of the quantities."""
+    """The crossings in a table: their numbers, counted from 1, in place of times; the names of the quantities; and whether the
+    states are those after the resets at the section."""
 
-    after: ClassVar[bool] = False
+    after: bool = False
 
     def variables(self, model: AbstractModel) -> dict[str, Variable]:
         """The variables of the table with the times and the quantities."""
@@ -249,12 +245,6 @@ class Crossings(Samples):
         numbers = (jnp.asarray(t1, float), jnp.asarray(count), jnp.asarray(int(self.times[0]) - 1))
         status, values = crossings_in_cells(cells, self.names, *numbers, settings, size, len(self.times), self.after)
         return status, jax.tree.map(np.asarray, values)
-
-
-class CrossingsAfter(Crossings):
-    """Crossings with the states after the resets at the section."""
-
-    after = True
 
 
 class Rise(eqx.Module):
@@ -357,7 +347,6 @@ def crossings(
     names = model.names if quantities is None else quantities
     require_names(model.quantities, names)
     options = Options(tolerance, solver, max_steps, scattered, False, (), path, progress, executor)
-    kind, crossing = (CrossingsAfter, "after") if side == "after" else (Crossings, "first")
-    samples = kind(np.arange(skip + 1.0, skip + count + 1.0), tuple(names))
-    named = named_axes(model, {} if axes is None else axes)
-    return table_of(model, named, float(t1), crossing, options, TableForm(), samples=samples, timed=False)
+    samples = Crossings(np.arange(skip + 1.0, skip + count + 1.0), tuple(names), side == "after")
+    crossing = "after" if side == "after" else "first"
+    return table_of(model, {} if axes is None else axes, t1, options, crossing, samples=samples, timed=False)

@@ -369,6 +369,12 @@ class Ensemble(eqx.Module):
         return self.problem.start()[0] if self.problem is not None else jnp.asarray(self.states)
 
 
+def counted(model: AbstractModel, outcome: Outcome | HybridOutcome) -> dict[str, Any]:
+    """When runs have ended, and the numbers of their steps and of what their model counts, by the names in a table."""
+    counts = dict(zip(model.counters, outcome.counts, strict=True)) if isinstance(outcome, HybridOutcome) else {}
+    return {"end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected} | counts
+
+
 def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Any, tolerance: Number) -> Any:
     """How each run has ended, as an integer of `Status`: `EVENT` for the runs whose event counts, because the run ended on
     the event or, if runs continue, ends beyond the event."""

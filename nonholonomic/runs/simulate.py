@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -19,7 +19,7 @@ from ..integration.problem import Status, legal_run, require_times
 from ..sweeps import Axis, Variable, axis
 from ..terminal import status_line
 from ..validation import as_known, as_number, explaining, is_traced, nan_unless, warn
-from .event import modes_of, problem_of
+from .event import counted, modes_of, problem_of
 from .model import AbstractModel, Names, Number, Start, check_run, model_of, run_of, settings_for_lanes
 from .trajectory import Trajectory
 
@@ -30,7 +30,8 @@ from .trajectory import Trajectory
 DENSE = 1000
 
 
-class Samples(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Samples:
     """The samples in a table: the times [s], and the names of the quantities."""
 
     times: Float[np.ndarray, " times"]
@@ -59,7 +60,7 @@ class Samples(NamedTuple):
         horizon = (jnp.asarray(t1, float), jnp.asarray(count), settings)
         if cells.smooth:
             outcome, status, values = _followed(problem_of(cells, size, names), cells, names, times, *horizon)
-            values |= {"end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
+            values |= counted(cells, outcome)
         else:
             start, counters = modes_of(cells, size, settings.tolerance, names), len(cells.counters)
             run, _ = solve_hybrid_with_samples(*start, times, *horizon, counters=counters)
@@ -103,6 +104,14 @@ def modes_of_run(modules: tuple[AbstractModel, Names], tolerance: Array, cells: 
     return modes_of(model, cells, tolerance, names)
 
 
+def nan_where(is_missing: Bool[Array, " times"], values: dict[str, Array]) -> dict[str, Array]:
+    """Quantities, the times along the first axis, with NaN at some times."""
+    return {
+        name: jnp.where(is_missing.reshape(-1, *[1] * (value.ndim - 1)), jnp.nan, value)
+        for name, value in values.items()
+    }
+
+
 def mode_at(number: Float[Array, "..."]) -> Int[Array, "..."]:
     """The index of the mode at each sample, -1 between two modes and after the end."""
     return jnp.where(jnp.isnan(number), -1, number).astype(int)
@@ -131,18 +140,12 @@ def _read_samples(
     """The `Status` of runs of several modes, and the variables of the table."""
 
     def of_cell(model: AbstractModel, rows: Array, number: Array, end_time: Array) -> dict[str, Array]:
-        values = model.read(names, times, rows.T, mode_at(number))
-        is_reached = times <= end_time
-        return {
-            name: jnp.where(is_reached.reshape(-1, *(1,) * (value.ndim - 1)), value, jnp.nan)
-            for name, value in values.items()
-        }
+        return nan_where(times > end_time, model.read(names, times, rows.T, mode_at(number)))
 
     outcome = outcome_of(samples)
     axes = (own_axis, 0, 0, 0)
     values = eqx.filter_vmap(of_cell, in_axes=axes)(cells, samples.states, samples.number, samples.end_time)
-    ending = {"end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
-    return cells.ended(outcome, tolerance), values | ending | dict(zip(cells.counters, outcome.counts, strict=True))
+    return cells.ended(outcome, tolerance), values | counted(cells, outcome)
 
 
 #: Default number of times to report.

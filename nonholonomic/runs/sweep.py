@@ -28,7 +28,7 @@ from ..validation import as_number, explaining, require_flag, require_outside, r
 from .event import Ensemble
 from .model import AbstractModel, AbstractSceneModel, Number, check_horizon, model_of, require_event, settings_for_lanes
 from .simulate import Samples
-from .table import ScatteredJob, TableForm, TableJob
+from .table import TableForm, TableJob
 
 # A checksum of the equations of a model, so that a table does not resume with the cells of other equations.
 
@@ -196,7 +196,6 @@ def sweep(
     check_horizon(t1, tolerance)
     samples = samples_of(model.quantities, times, quantities, t1)
     options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
-    named = named_axes(model, axes)
     timed = samples is None or event is not None
     for name, option in {"errors": errors, "sensitivities": list(sensitivities)}.items() if not timed else ():
         if option:
@@ -204,17 +203,7 @@ def sweep(
                 f"{name} = {shown(option)}: these are {name} of the time of an event, and without event= the runs are only "
                 "sampled; pass event=, or leave out times and quantities"
             )
-    return table_of(model, named, float(t1), crossing, options, TableForm(), samples=samples, timed=timed)
-
-
-def named_axes(model: AbstractModel, axes: Any) -> dict[str, Any]:
-    """The axes of a table by the full names of their parameters, checked."""
-    if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
-        raise ValueError(f"axes = {shown(axes)} must be a dictionary, name of a number -> values")
-    named = {model.full_name("axes", name): values for name, values in axes.items()}
-    if len(named) < len(axes):
-        raise ValueError(f"axes = {', '.join(axes)}: a number is named twice")
-    return named
+    return table_of(model, axes, t1, options, crossing, samples=samples, timed=timed)
 
 
 def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Number | None) -> Samples | None:
@@ -241,23 +230,28 @@ def require_names(known: dict[str, Quantity], quantities: Sequence[str]) -> None
 
 def table_of(
     model: AbstractModel,
-    axes: dict[str, Any],
+    axes: Any,
     t1: float,
-    crossing: str,
     options: Options,
-    form: TableForm,
+    crossing: str = "first",
+    form: TableForm = TableForm(),  # noqa: B008  Nothing changes it.
     *,
     samples: Samples | None = None,
     timed: bool = True,
 ) -> Table:
-    """The table of a model. **Arguments:** `axes`: full name of a parameter -> values; the others as for `TableJob`."""
+    """The table of a model. **Arguments:** `axes`: as for `sweep`; the others as for `TableJob`, checked."""
+    if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
+        raise ValueError(f"axes = {shown(axes)} must be a dictionary, name of a number -> values")
+    named = {model.full_name("axes", name): values for name, values in axes.items()}
+    if len(named) < len(axes):
+        raise ValueError(f"axes = {', '.join(axes)}: a number is named twice")
     sensitivities = full_sensitivities(model, options.sensitivities, crossing)
-    labels = model.label([*axes, *(name for name in sensitivities if name not in axes)])
-    grid = [axis(labels[name][0], name, labels[name][1], values, labels[name][2]) for name, values in axes.items()]
+    labels = model.label([*named, *(name for name in sensitivities if name not in named)])
+    grid = [axis(labels[name][0], name, labels[name][1], values, labels[name][2]) for name, values in named.items()]
     slopes = {name: f"time_by_{labels[name][0]}" for name in sensitivities}
-    job = TableJob(model, form, t1, crossing, options.settings, slopes, options.errors, samples, timed)
+    job = TableJob(model, form, float(t1), crossing, options.settings, slopes, options.errors, samples, timed)
     check_cells(model, grid, options)
-    request = {"t1": t1} | ({} if crossing == "first" else {"crossing": crossing})
+    request = {"t1": float(t1)} | ({} if crossing == "first" else {"crossing": crossing})
     return compute_table(job, grid, request, options)
 
 
@@ -299,22 +293,16 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
     integrator = job.settings.for_single_runs if job.by_diffrax else job.settings.for_lanes
     request |= {"tolerance": float(options.tolerance), "solver": type(integrator).__name__}
     request |= {SHOWN_IN: unit_of(job.model)}
-    # Requests of earlier versions, with which a table may resume, lack these unless they were set.
-    request |= {"max_steps": int(options.max_steps)} if options.max_steps != DEFAULT_MAX_STEPS else {}
-    request |= {"errors": "from runs at 1e-2 and 1e-4 of the tolerance"} if options.errors else {}
-    request |= {"sensitivities": list(slopes)} if slopes else {}
+    request |= {"max_steps": int(options.max_steps), "errors": bool(options.errors), "sensitivities": list(slopes)}
     if options.path is not None and has_users_code(job.model.__reduce__()[1]):
         request |= {EQUATIONS: checksum_of(job.model)}
-    work: Any = job
-    listed: dict[str, Any] | None = None
     if options.scattered:
-        listed = scattered_cells(grid)
         checksum = hashlib.sha256()
-        for name, values in listed.items():
-            checksum.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
+        for axis in grid:
+            checksum.update(axis.number.encode() + np.ascontiguousarray(axis.values, float).tobytes())
         request |= {"cells": checksum.hexdigest()[:16]}
         variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
-        work = ScatteredJob(job, listed, {axis.number: axis.name for axis in grid})
+        job = job._replace(listed=tuple(grid))
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
     cells, is_scene = size_of(grid), isinstance(job.model, AbstractSceneModel)
     chunk = None if is_scene or cells <= 4 * LEAST_CHUNK else max(LEAST_CHUNK, chunk_for(cells))
@@ -325,11 +313,12 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
         # A run has about a dozen components.
         most = max(16, 1 << (MOST_SAMPLED // (12 * len(job.samples.times))).bit_length() - 1)
     running = {"path": options.path, "progress": options.progress, "executor": options.executor}
-    table = sweeps.sweep(work, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
+    table = sweeps.sweep(job, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
     illegal = cells_with(table, "status", Status.ILLEGAL.word)
     if len(illegal):
-        first, of_all = (illegal[0], listed) if listed is not None else (0, columns(grid, int(illegal[0]), 1))
-        values = {name: float(values[first]) for name, values in of_all.items()}
+        values = {name: float(value[0]) for name, value in columns(grid, int(illegal[0]), 1).items()}
+        if job.listed:
+            values = {axis.number: float(axis.values[illegal[0]]) for axis in job.listed}
         reason = ""
         try:
             job.model.replaced(values).check()

@@ -13,9 +13,9 @@ from ..derivatives import tangent_scale, tangents_of
 from ..hybrid import HybridOutcome
 from ..integration import Outcome, Settings, solve_by_diffrax
 from ..integration.problem import TIGHTEST, TIGHTEST_IN_SINGLE, Status
-from ..sweeps import Variable
+from ..sweeps import Axis, Variable
 from ..validation import as_number
-from .event import SILENT, Ensemble, status_of
+from .event import SILENT, Ensemble, counted, status_of
 from .model import AbstractModel, Number
 from .simulate import Samples
 
@@ -32,7 +32,8 @@ class TableForm(NamedTuple):
     - `named`: statuses in place of others.
     - `event`: what the event is, for descriptions of variables.
     - `run`: the word for a run in descriptions.
-    - `time`: name of the variable of the event's time; `order`: the variables in order, by default as they come.
+    - `time`, `of_time`: name and description of the variable of the event's time; `order`: the variables in order, by default
+      as they come.
     - `left_open`: what a run that ends at the first event leaves open, if it is to be said.
     - `nan_if_failed`: whether the time of a run without a result is NaN; otherwise it is infinite.
     """
@@ -41,6 +42,7 @@ class TableForm(NamedTuple):
     event: str = "event"
     nan_if_failed: bool = True
     time: str = "time"
+    of_time: str = "time of the event"
     run: str = "run"
     order: tuple[str, ...] | None = None
     left_open: str = ""
@@ -62,6 +64,7 @@ class TableJob(NamedTuple):
     - `samples`: the quantities at given times, or `None`; `timed`: whether runs are timed, not only sampled.
     - `by_diffrax`: whether Diffrax solves smooth runs, one by one, as a slow reference.
     - `nudge`: relative change of the initial states of runs with resets, which shows how resets amplify round-off.
+    - `listed`: the numbers of scattered cells, which the results include; without a grid, the only axis counts the cells.
     """
 
     model: AbstractModel
@@ -75,6 +78,7 @@ class TableJob(NamedTuple):
     timed: bool = True
     by_diffrax: bool = False
     nudge: float = 0.0
+    listed: tuple[Axis, ...] = ()
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -96,9 +100,7 @@ class TableJob(NamedTuple):
             return self.samples.variables(self.model) | self._ending({}) if self.samples is not None else {}
         event = self.form.event
         words = {f"{name}_time": f"{name} {event} time" for name in ("first", "last")}
-        words[self.form.time] = {"event": "time of the event", "loss of contact": event}.get(event, f"{event} time")
-        if self.form.left_open:
-            words[self.form.time] = f"{self.crossing} {event} time"
+        words[self.form.time] = self.form.of_time.format(crossing=self.crossing)
         words = {name: words[name] for name in self.times}
         words |= {name: text for name, (text, _) in self.model.further_times.items()}
         variables = {name: Variable("s", np.float64, long_name=text) for name, text in words.items()}
@@ -133,6 +135,11 @@ class TableJob(NamedTuple):
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
+        if self.listed:
+            values = [axis.values[columns["cell"]] for axis in self.listed]
+            numbers, names = ([getattr(axis, key) for axis in self.listed] for key in ("number", "name"))
+            job = self._replace(listed=())
+            return job(dict(zip(numbers, values, strict=True)), count) | dict(zip(names, values, strict=True))
         if self.by_diffrax and count == 0:
             # Diffrax always computes a whole chunk, so a call only to compile would compute the first chunk twice.
             return {}
@@ -213,12 +220,9 @@ class TableJob(NamedTuple):
                 time = outcome.first_crossing
             is_silent = self.form.nan_if_failed & np.isin(status, SILENT)
             variables[self.times[-1]] = np.where(is_silent, np.nan, time)
-        variables |= {"status": self.form.codes[np.asarray(status)], "end_time": np.asarray(outcome.end_time)}
-        if self.samples is None:
-            variables |= {name: np.asarray(values) for name, values in ends.items()}
-        variables |= {"steps": np.asarray(outcome.steps), "rejected": np.asarray(outcome.rejected)}
-        if isinstance(outcome, HybridOutcome):
-            variables |= dict(zip(self.model.counters, outcome.counts, strict=True))
+        ends = ends if self.samples is None else {}
+        variables |= jax.tree.map(np.asarray, ends | counted(self.model, outcome))
+        variables["status"] = self.form.codes[np.asarray(status)]
         if self.crossing == "both":
             if isinstance(outcome, HybridOutcome):
                 # With several modes, the first event needs a separate solve, which ends there.
@@ -281,23 +285,6 @@ def _with_tangents(
         for row in range(len(names))
     ]
     return build(*point), tangents_of(build, point, tangents), scales
-
-
-class ScatteredJob(NamedTuple):
-    """A job whose cells are listed in columns, one row per cell. The results include the columns.
-
-    `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
-    """
-
-    job: TableJob
-    columns: dict[str, Any]
-    names: dict[str, str]
-
-    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which only the first `count` are run."""
-        values_of_columns = {number: values[columns["cell"]] for number, values in self.columns.items()}
-        listed = {self.names[number]: values for number, values in values_of_columns.items()}
-        return self.job(values_of_columns, count) | listed
 
 
 # Error bounds for a table, from two more runs of each cell at smaller tolerances.

@@ -317,6 +317,7 @@ FORM = TableForm(
     event="loss of contact",
     nan_if_failed=False,
     time="contact_time",
+    of_time="loss of contact",
     run="ride",
     order=TAKEN,
 )
@@ -444,7 +445,7 @@ def sweep(
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {shown(axes)} must be a dictionary, full name of a parameter -> values")
     options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor)
-    return table_of(model, full_axes(axes, model.known), float(t1), "first", options, FORM)
+    return table_of(model, full_axes(axes, model.known), t1, options, form=FORM)
 
 
 # Estimate parameters of a stroller, its ground and its launch from recorded rides, and their posterior.

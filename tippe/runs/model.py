@@ -121,11 +121,15 @@ def variable_numbers(scene: Scene) -> list[str]:
 INVERSIONS = TableForm(
     {Status.EVENT: Status.INVERTED, Status.COMPLETED: Status.NOT_INVERTED},
     "inversion",
+    of_time="{crossing} inversion time",
     nan_if_failed=False,
     left_open="runs end when first inverted, and crossing='both' tells which stay so",
 )
 REVERSALS = TableForm(
-    {Status.EVENT: Status.REVERSED, Status.COMPLETED: Status.NOT_REVERSED}, "reversal", nan_if_failed=False
+    {Status.EVENT: Status.REVERSED, Status.COMPLETED: Status.NOT_REVERSED},
+    "reversal",
+    of_time="reversal time",
+    nan_if_failed=False,
 )
 
 #: The numbers of a run's end.
