@@ -159,7 +159,8 @@ class Orbit(eqx.Module):
         largest = 1.0 / STEPS if step is None else min(float(step) / abs(course.last - course.first), 0.5)
         found, kinds, end = course.followed(largest, points)
         values = jnp.asarray([point.value for point in found])
-        return Branch(full, values, course.orbits(found), tuple(kinds), end, period)
+        orbits = jax.tree.map(lambda *parts: jnp.asarray(np.stack(parts)), *(point.orbit for point in found))
+        return Branch(full, values, orbits, tuple(kinds), end, period)
 
     def __repr__(self) -> str:
         if is_traced(self) or np.ndim(self.period):
@@ -303,7 +304,7 @@ class Branch(eqx.Module):
         for distance in ASIDE:
             new = course.corrected(begin + distance * aside, aside)
             if not isinstance(new, int):
-                return jax.tree.map(lambda part: part[0], course.orbits([new]))
+                return jax.tree.map(jnp.asarray, new.orbit)
         raise ValueError(f"no orbit of the other branch was found near {self.name} = {value:.10g}: {end_of(int(new))}")
 
     def to_table(self) -> Table:

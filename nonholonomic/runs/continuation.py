@@ -7,8 +7,9 @@ Keller, Numerical solution of bifurcation and nonlinear eigenvalue problems, 197
 Theory, ch. 10.
 """
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +18,6 @@ from jaxtyping import Array, Float
 
 from ..compilation.xla_cpu import compiled_for_one
 from ..integration.problem import TIGHTEST
-
-if TYPE_CHECKING:
-    from .branch import Orbit
 
 #: Kinds of special points, in the order of the first entries of `Point.tests`.
 KINDS = FOLD, DOUBLING, TORUS, CROSSING = "fold", "period doubling", "Neimark-Sacker", "branch point"
@@ -158,22 +156,18 @@ class Point(NamedTuple):
 
     - `unknowns`: the free components of the state and the number, in units of their scales; `matrix`: the derivative of the
       residual by them, and `tangent`: of the branch.
-    - `state`, `value`, `period`, `error`: of the orbit, and the number; `jacobian`, `multipliers`: of the return map.
+    - `orbit`: the orbit, of NumPy arrays; `value`: the number; `jacobian`: of the return map.
     - `tests`: functions that change their signs at the `KINDS`, at the last value of the number and at the first.
-    - `iterations`, `resets`: number of Newton steps and of resets in a period.
+    - `resets`: number of resets in a period.
     """
 
     unknowns: np.ndarray
     matrix: np.ndarray
     tangent: np.ndarray
-    state: np.ndarray
+    orbit: Any
     value: float
-    period: float
-    error: float
     jacobian: np.ndarray
-    multipliers: np.ndarray
     tests: np.ndarray
-    iterations: int
     resets: int
 
 
@@ -199,24 +193,6 @@ class Continuation(NamedTuple):
         """The unknowns at the orbit."""
         state = np.array(self.orbit.state)[list(self.orbit.search.free)]
         return np.append(state / self.scale, self.first / (self.last - self.first))
-
-    def orbits(self, points: Sequence[Point]) -> "Orbit":
-        """The orbits of some points, as a batch."""
-        search, count = self.orbit.search, len(points)
-        states, values = np.stack([point.state for point in points]), np.array([point.value for point in points])
-        leaves = [np.broadcast_to(leaf, (count,)) for leaf in self.orbit.leaves]
-        for k in self.others:
-            leaves[k] = values
-        for k, column in zip(search.starts, states.T, strict=True):
-            leaves[k] = column
-        periods, errors = (np.array(part) for part in ([p.period for p in points], [p.error for p in points]))
-        if search.is_driven:
-            leaves[search.horizon] = periods / self.returns
-        numbers = (periods, states, np.stack([point.multipliers for point in points]), errors, errors)
-        iterations, none = np.array([point.iterations for point in points]), np.zeros(count, int)
-        counts = (none + int(self.orbit.family), iterations, none)
-        parts = jax.tree.map(jnp.asarray, (*numbers, *counts)), tuple(map(jnp.asarray, leaves))
-        return type(self.orbit)(*parts[0], self.orbit.names, parts[1], search, self.returns)
 
     def repeats(self) -> bool:
         """Whether a drive repeats after its period at the last value of the number: unless two periods from the orbit lead
@@ -282,7 +258,7 @@ class Continuation(NamedTuple):
         moved[list(search.free)] = change[:-1] * self.scale
         state[list(search.free)] = unknowns[:-1] * self.scale
         value = float(unknowns[-1]) * span
-        period = float(new.time + new.time_by_state @ moved + new.time_by_number * change[-1] * span)
+        period = new.time + new.time_by_state @ moved + new.time_by_number * change[-1] * span
         values = np.linalg.eigvals(new.by_state).astype(complex)
         values = values[np.argsort(-np.abs(values), kind="stable")]
         pairs = (values[:, None] * values)[np.triu_indices(len(values), 1)]
@@ -294,8 +270,20 @@ class Continuation(NamedTuple):
         tests = np.array([tangent[-1], np.prod(values + 1.0).real, rotation, crossing, *bounds])
         multipliers = values[: len(values) - (not search.is_driven)]
         error = max(5.0 * float(np.abs(change).max()), 1e-14) * self.scale
-        numbers = (value, period, error, np.asarray(new.by_state), multipliers, tests, steps, int(new.resets))
-        return Point(unknowns, matrix, tangent, state, *numbers)
+        numbers = {search.horizon: period / self.returns} if search.is_driven else {}
+        numbers |= dict.fromkeys(self.others, value) | dict(zip(search.starts, state, strict=True))
+        orbit = dataclasses.replace(
+            self.orbit,
+            period=period,
+            state=state,
+            multipliers=multipliers,
+            error=error,
+            residual=error,
+            iterations=steps,
+            leaves=tuple(numbers.get(k, leaf) for k, leaf in enumerate(self.orbit.leaves)),
+            returns=self.returns,
+        )
+        return Point(unknowns, matrix, tangent, orbit, value, np.asarray(new.by_state), tests, int(new.resets))
 
     def between(self, old: Point, new: Point, distance: float) -> Point | int:
         """The point that cubic interpolation gives: near a branch point, Newton's method may converge to the other branch."""
@@ -345,7 +333,7 @@ class Continuation(NamedTuple):
             if zero is None:
                 return None
             # Two real multipliers whose product is 1 are no Neimark-Sacker point.
-            if test != KINDS.index(TORUS) or is_rotating(zero[1].multipliers):
+            if test != KINDS.index(TORUS) or is_rotating(zero[1].orbit.multipliers):
                 zeros.append((zero[0], test, zero[1]))
         return sorted(zeros, key=lambda zero: zero[:2])
 
@@ -381,7 +369,8 @@ class Continuation(NamedTuple):
                 points, kinds = [*points, point], [*kinds, KINDS[test]]
             if points[-1] is not new:
                 points, kinds = [*points, new], [*kinds, REGULAR]
-            factor = 1.5 if is_free and new.iterations < USUAL else 1.0 if new.iterations <= USUAL else 0.5
+            steps = new.orbit.iterations
+            factor = 1.5 if is_free and steps < USUAL else 1.0 if steps <= USUAL else 0.5
             length, is_free = min(factor * length, step), True
         return points, kinds, f"there are {count} points; pass points= for more"
 

@@ -31,8 +31,8 @@ from ..validation import as_number, explaining, is_traced, require_outside
 from .branch import Orbit
 from .continuation import FINER, ILLEGAL, NEAR, RANK, REASONS, SAME_ORBIT
 from .crossings import SAME, on_margin, require_section, section_of
-from .event import Ensemble, EventTime, modes_of
-from .model import AbstractModel, AbstractSceneModel, check_run, model_of, settings_for_lanes
+from .event import EventTime, modes_of
+from .model import AbstractModel, AbstractSceneModel, Start, check_run, model_of, settings_for_lanes
 
 #: The most Newton steps; the residual at which they have converged, in units of the tolerance.
 MOST_NEWTON, CONVERGED = 30, 30.0
@@ -74,18 +74,16 @@ class Return(NamedTuple):
 class Newton(NamedTuple):
     """The state of Newton's iteration, and its last return.
 
-    - `count`: number of returns so far; `state`: (components, cells); `is_done`, `is_fine`: whether all cells have converged,
-      also at the finer tolerance; `is_finished`: whether also the drive has been checked; `reason`: as for `Orbit`, where the
-      search has been given up; `iterations`.
+    - `count`: number of returns so far; `state`: (components, cells); `stage`: 1 after all cells have converged, 2 after a step
+      at the finer tolerance, 3 after the check of the drive; `reason`: as for `Orbit`, where the search has been given up;
+      `iterations`.
     - `in_motion`, `time`, `by_state`, `time_by_state`: of the last return; `inverse`: of 1 - J.
     - `residual`, `step`: by how much the last return missed, and the length of the last step.
     """
 
     count: Array
     state: Array
-    is_done: Array
-    is_fine: Array
-    is_finished: Array
+    stage: Array
     reason: Array
     iterations: Array
     in_motion: Array
@@ -111,13 +109,16 @@ class OrbitSolve(EventTime):
     with_multipliers: bool = eqx.field(static=True, default=True)
 
     @classmethod
-    def of_model(cls, model: Any, t1: Array, settings: Settings, *options: Any) -> tuple[Any, ...]:
-        """The solve and its leaves. **Arguments:** `options`: the fields from `is_driven` on."""
+    def of_model(
+        cls, model: Any, t1: Array, settings: Settings, is_driven: bool, free: tuple[int, ...]
+    ) -> tuple[Any, ...]:
+        """The solve and its leaves. **Arguments:** as for `EventTime.of`, and fields."""
         timed, *leaves = EventTime.of(model, t1, settings, False)
         of_start = {id(number) for number in model.reduced_start}
         starts = tuple(k for k, leaf in enumerate(leaves) if id(leaf) in of_start)
-        movable, *rest = (getattr(timed, field.name) for field in dataclasses.fields(timed))
-        return (cls(movable + 1, *rest, starts, *options), *leaves)
+        parts = {field.name: getattr(timed, field.name) for field in dataclasses.fields(timed)}
+        parts["movable"] += 1
+        return (cls(**parts, starts=starts, is_driven=is_driven, free=free), *leaves)
 
     def __reduce__(self) -> tuple[type[None], tuple[()]]:
         # A user's classes may not be pickled, but the numbers of an orbit can.
@@ -178,17 +179,17 @@ class OrbitSolve(EventTime):
         """
         active, settings = (*self.starts, *others), self.settings.with_tolerance(tolerance)
 
-        def build(leaves: tuple[Array, ...], cells: int | None) -> Ensemble:
+        def build(leaves: tuple[Array, ...], cells: int | None) -> Start:
             assert cells is not None
             model = self.model(leaves)
-            return Ensemble(None, *modes_of(model, cells, tolerance, model.comparable), 1, False)
+            return modes_of(model, cells, tolerance, model.comparable)
 
-        ensemble, tangents, gather = tangents_by(build, active, leaves, cells)
-        pairs = tuple((tangent.modes, tangent.states) for tangent in tangents)
-        modes = variational_modes(ensemble.modes, pairs, tolerance, not self.is_driven)
-        start, size = variational_start(ensemble.states, pairs), len(ensemble.states)
+        (modes, first, states), tangents, gather = tangents_by(build, active, leaves, cells)
+        pairs = tuple((of_modes, of_states) for of_modes, _, of_states in tangents)
+        modes = variational_modes(modes, pairs, tolerance, not self.is_driven)
+        start, size = variational_start(states, pairs), len(states)
         options = {"counters": 1 + max(1, len(self.model(leaves).counters)), "n_blocks": 1 + len(pairs), "traced": True}
-        ended = solve_hybrid(modes, ensemble.first, start, left, cells, settings, **options)
+        ended = solve_hybrid(modes, first, start, left, cells, settings, **options)
         rows = jnp.reshape(ended.state, (1 + len(pairs), size + 1, cells))
         # A run that has ended at a reset which jumps over the zero is in no mode.
         point, slopes, mode = rows[0, :size], rows[1:], ended.mode % len(modes)
@@ -221,7 +222,7 @@ class OrbitSolve(EventTime):
         wanted, missing = (REACHED_END, 5) if self.is_driven else (CROSSED, 1)
         has_failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
         faults = [has_failed, ended.status != wanted, at_edge & self.is_driven, ended.counts[-1] > 0]
-        reason = jnp.select([*faults, mode != ensemble.first], [6, missing, 8, 7, 2], 0)
+        reason = jnp.select([*faults, mode != first], [6, missing, 8, 7, 2], 0)
         by_state, time_by_state = (jnp.stack(parts[:count], axis=-1) for parts in (changes, delays))
         time = ended.end_time if self.is_driven else ended.crossing_time
         by_numbers = (changes[count:], delays[count:])
@@ -281,11 +282,11 @@ class OrbitSolve(EventTime):
 
         def step(old: Newton) -> Newton:
             is_bad, state = old.reason > 0, old.state
-            tolerance_now = jnp.where(old.is_done, finer, tolerance)
+            tolerance_now = jnp.where(old.stage > 0, finer, tolerance)
             moved, shift, falls = self.on_section(leaves, cells, state)
             is_near = falls & (jnp.abs(shift) < NEAR * old.time)
             state = jnp.where(old.in_motion & is_near & ~is_bad, moved, state)
-            verifies = old.is_fine & is_checked
+            verifies = old.stage == 2
             left = jnp.where(is_bad, 0.0, jnp.where(verifies, 2.0 * t1, t1))
             new = self.returned(self.with_start(leaves, state), cells, (), tolerance_now, left)
             miss = new.state - state
@@ -315,13 +316,11 @@ class OrbitSolve(EventTime):
             # An orbit also returns after two periods, unless the drive has another one.
             growth = jnp.maximum(1.0, jnp.max(jnp.abs(new.by_state), axis=(1, 2)))
             is_same = (new.reason == 0) & (residual <= (SAME_ORBIT + CONVERGED * tolerance) * scale * growth)
-            checked = old._replace(is_finished=verifies, reason=jnp.where(is_bad | is_same, old.reason, 9))
+            checked = old._replace(stage=old.stage + 1, reason=jnp.where(is_bad | is_same, old.reason, 9))
             corrected = Newton(
                 old.count + 1,
                 jnp.where(reason > 0, state, following),
-                jnp.all(converged | (reason > 0)),
-                old.is_done,
-                old.is_done & (not is_checked),
+                jnp.where(old.stage == 1, 2, jnp.all(converged | (reason > 0)).astype(int)),
                 reason,
                 old.iterations + (reason == 0),
                 new.in_motion,
@@ -334,12 +333,12 @@ class OrbitSolve(EventTime):
             )
             return jax.tree.map(lambda old, new: jnp.where(verifies, old, new), checked, corrected)
 
-        false, zeros, whole = jnp.asarray(False), jnp.zeros(cells), jnp.zeros(cells, int)
+        zeros, whole, none = jnp.zeros(cells), jnp.zeros(cells, int), jnp.zeros((), int)
         reason = jnp.where(is_legal, whole, ILLEGAL)
         matrices = (jnp.zeros((cells, size, size)), jnp.zeros((cells, size)), jnp.zeros((cells, len(self.free), size)))
         of_last = (jnp.zeros(cells, bool), zeros, *matrices, zeros, zeros)
-        begin = Newton(jnp.zeros((), int), start, false, false, false, reason, whole, *of_last)
-        return jax.lax.while_loop(lambda newton: ~newton.is_finished, step, begin)
+        begin = Newton(none, start, none, reason, whole, *of_last)
+        return jax.lax.while_loop(lambda newton: newton.stage < 2 + is_checked, step, begin)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> tuple[Array, ...]:
         return self.parts_of(self.newton(cells, leaves))
