@@ -23,7 +23,6 @@ from ..views.plot import new_figure
 from .continuation import (
     ASIDE,
     CROSSING,
-    DIVERGES,
     DOUBLING,
     ILLEGAL,
     OF_A_FAMILY,
@@ -31,8 +30,7 @@ from .continuation import (
     REGULAR,
     STEPS,
     Continuation,
-    Point,
-    end_of,
+    NoPoint,
 )
 
 # Only for type checkers: xarray is optional.
@@ -285,9 +283,10 @@ class Branch(eqx.Module):
         kind, value, orbit = special[k]
         course, _ = continuation_of(orbit, self.name, value + float(np.ptp(self.values)), self.period)
         begin = course.begin
-        old = course.corrected(begin, np.eye(len(begin))[-1])
-        if isinstance(old, int):
-            raise ValueError(f"the special point is no orbit: {end_of(old)}")
+        try:
+            old = course.corrected(begin, np.eye(len(begin))[-1])
+        except NoPoint as error:
+            raise ValueError(f"the special point is no orbit: {error}") from None
         if kind == DOUBLING:
             values, vectors = np.linalg.eig(old.jacobian)
             aside = np.append(np.real(vectors[list(orbit.search.free), np.argmin(np.abs(values + 1.0))]), 0.0)
@@ -300,12 +299,13 @@ class Branch(eqx.Module):
             plane = np.linalg.svd(old.matrix)[2][-2:]
             aside = plane.T @ np.linalg.svd((plane @ along)[None])[2][-1]
         aside = aside / np.linalg.norm(aside)
-        new: Point | int = DIVERGES
+        reason = ""
         for distance in ASIDE:
-            new = course.corrected(begin + distance * aside, aside)
-            if not isinstance(new, int):
-                return jax.tree.map(jnp.asarray, new.orbit)
-        raise ValueError(f"no orbit of the other branch was found near {self.name} = {value:.10g}: {end_of(int(new))}")
+            try:
+                return jax.tree.map(jnp.asarray, course.corrected(begin + distance * aside, aside).orbit)
+            except NoPoint as error:
+                reason = str(error)
+        raise ValueError(f"no orbit of the other branch was found near {self.name} = {value:.10g}: {reason}")
 
     def to_table(self) -> Table:
         """The branch as a `Table` over its points: `value`, `period` [s], the components of the state, the real and imaginary

@@ -42,9 +42,12 @@ REASONS = (
 ILLEGAL, CHANGES, DIVERGES = 10, 11, 12
 
 
-def end_of(reason: int) -> str:
-    """Why a branch ends, in words."""
-    return REASONS[reason].format(start="", run="", t1="", at_rest="")
+class NoPoint(Exception):
+    """There is no point of a branch, or no further one; `reason`: why, as the place in `REASONS`."""
+
+    def __init__(self, reason: int):
+        super().__init__(REASONS[reason].format(start="", run="", t1="", at_rest=""))
+        self.reason = reason
 
 
 #: The largest step as a part of the range of the number; the smallest, as a part of the largest.
@@ -86,18 +89,15 @@ ASIDE = (1e-2, 3e-3, 1e-3)
 class Returns(NamedTuple):
     """Several returns as one map, from a `start` that was moved onto the section.
 
-    - `time` [s], `state`, `by_state`, `by_number`: of the last return, with its derivatives by the start and the number;
-      `time_by_state`, `time_by_number`: those of the time.
+    - `time` [s], `state`: of the last return; `by`, `time_by`: their derivatives by the start and, last, the number.
     - `in_motion`, `reason`, `resets`: as for `Return`.
     """
 
     start: Array
     time: Array
     state: Array
-    by_state: Array
-    by_number: Array
-    time_by_state: Array
-    time_by_number: Array
+    by: Array
+    time_by: Array
     in_motion: Array
     reason: Array
     resets: Array
@@ -127,7 +127,6 @@ def several_returns(
         state = jnp.where(is_near, moved[:, 0], old.state)
         left = jnp.where(old.reason > 0, 0.0, leaves[search.horizon])
         new = search.returned(search.with_start(leaves, state[:, None]), 1, others, tolerance, left)
-        by_state, time_by_state = new.by_state[0], new.time_by_state[0]
         by_number = sum((part[0] for part in new.by_numbers), jnp.zeros_like(state))
         delay = sum((part[0] for part in new.time_by_numbers), jnp.zeros(()))
         if search.is_driven:
@@ -136,19 +135,16 @@ def several_returns(
             jnp.where(k == 0, state, old.start),
             old.time + new.time[0],
             new.state[:, 0],
-            by_state @ old.by_state,
-            by_state @ old.by_number + by_number,
-            old.time_by_state + time_by_state @ old.by_state,
-            old.time_by_number + time_by_state @ old.by_number + delay,
+            (new.by_state[0] @ old.by).at[:, -1].add(by_number),
+            (old.time_by + new.time_by_state[0] @ old.by).at[-1].add(delay),
             new.in_motion[0],
             jnp.where(old.reason > 0, old.reason, new.reason[0]),
             old.resets + new.resets[0],
         )
 
-    zero, zeros, whole = jnp.zeros(()), jnp.zeros_like(state), jnp.zeros((), int)
-    slopes = (jnp.eye(len(state)), zeros, zeros, zero)
-    begin = Returns(state, zero, state, *slopes, jnp.asarray(False), whole, whole)
-    return jax.lax.fori_loop(0, count, following, begin)
+    zero, whole, size = jnp.zeros(()), jnp.zeros((), int), len(state)
+    slopes = (jnp.eye(size, size + 1), jnp.zeros(size + 1))
+    return jax.lax.fori_loop(0, count, following, Returns(state, zero, state, *slopes, whole > 0, whole, whole))
 
 
 class Point(NamedTuple):
@@ -189,23 +185,27 @@ class Continuation(NamedTuple):
     in_motion: bool = True
 
     @property
+    def units(self) -> np.ndarray:
+        """The units of the unknowns."""
+        return np.array([self.scale] * len(self.orbit.search.free) + [self.last - self.first])
+
+    @property
     def begin(self) -> np.ndarray:
         """The unknowns at the orbit."""
-        state = np.array(self.orbit.state)[list(self.orbit.search.free)]
-        return np.append(state / self.scale, self.first / (self.last - self.first))
+        return np.append(np.array(self.orbit.state)[list(self.orbit.search.free)], self.first) / self.units
 
     def repeats(self) -> bool:
         """Whether a drive repeats after its period at the last value of the number: unless two periods from the orbit lead
         elsewhere than one of twice the length."""
         unknowns = np.append(self.begin[:-1], self.last / (self.last - self.first))
         once, twice = self.evaluated(unknowns, 2), self._replace(returns=2 * self.returns).evaluated(unknowns)
-        distance, growth = np.abs(once.state - twice.state).max(), max(1.0, np.abs(twice.by_state).max())
+        distance, growth = np.abs(once.state - twice.state).max(), max(1.0, np.abs(twice.by[:, :-1]).max())
         same = SAME_ORBIT * growth * max(self.scale, np.abs(twice.state).max())
         return bool(once.reason or twice.reason or distance <= same)
 
     def evaluated(self, unknowns: np.ndarray, periods: int = 1) -> Returns:
         """The returns from a state, for a value of the number. **Arguments:** `periods`: of the drive, in a return."""
-        search, value = self.orbit.search, unknowns[-1] * (self.last - self.first)
+        search, (*moved, value) = self.orbit.search, unknowns * self.units
         leaves, rate = [np.asarray(leaf) for leaf in self.orbit.leaves], 0.0
         for k in self.others:
             leaves[k] = np.asarray(value)
@@ -214,34 +214,34 @@ class Continuation(NamedTuple):
             leaves[search.horizon], rate = np.asarray(horizon), float(slope)
         leaves[search.horizon] = leaves[search.horizon] * float(periods)
         state, tolerance = np.array(self.orbit.state), max(float(leaves[-1]) / FINER, TIGHTEST)
-        state[list(search.free)] = unknowns[:-1] * self.scale
+        state[list(search.free)] = moved
         time = float(self.orbit.period) / self.orbit.returns
         numbers = map(np.asarray, (state, rate, time, self.in_motion, tolerance, self.returns))
         return jax.tree.map(np.asarray, several_returns(search, tuple(leaves), self.others, *numbers))
 
     def linearized(self, unknowns: np.ndarray) -> tuple[Returns, np.ndarray, np.ndarray]:
-        """The returns, the derivative of the residual by the unknowns, and the unknowns at the start that was moved."""
+        """The returns, the derivative of the residual by the unknowns, and the unknowns at the start that was moved; raises
+        `NoPoint` if a return fails."""
         new, free = self.evaluated(unknowns), list(self.orbit.search.free)
-        by_number = new.by_number[:, None] * ((self.last - self.first) / self.scale)
-        matrix = np.hstack([(np.eye(len(new.state)) - new.by_state)[:, free], -by_number])
+        matrix = (np.eye(len(new.by), len(new.by) + 1) - new.by)[:, [*free, -1]] * (self.units / self.scale)
+        if new.reason > 0 or not np.isfinite(matrix).all():
+            raise NoPoint(int(new.reason) or DIVERGES)
         return new, matrix, np.append(new.start[free] / self.scale, unknowns[-1])
 
-    def corrected(self, guess: np.ndarray, tangent: np.ndarray) -> Point | int:
-        """The point of the branch in the hyperplane through a guess across the tangent, or why there is none."""
+    def corrected(self, guess: np.ndarray, tangent: np.ndarray) -> Point:
+        """The point of the branch in the hyperplane through a guess across the tangent; raises `NoPoint` if there is none."""
         unknowns, tolerance = guess, float(self.orbit.leaves[-1])
         for iteration in range(1, MOST_NEWTON + 1):
             new, matrix, unknowns = self.linearized(unknowns)
-            if new.reason > 0 or not np.isfinite(matrix).all():
-                return int(new.reason) or DIVERGES
             miss, rows = (new.state - new.start) / self.scale, np.vstack([matrix, tangent])
             change = np.linalg.lstsq(rows, np.append(miss, tangent @ (guess - unknowns)), rcond=ROUND_OFF)[0]
             unknowns = unknowns + change
-            size = max(1.0, float(np.abs(new.by_state).max()))
+            size = max(1.0, float(np.abs(new.by[:, :-1]).max()))
             if max(np.abs(miss).max() / size, np.abs(change).max() * tolerance**0.5) <= CONVERGED * tolerance:
                 along = np.linalg.svd(matrix)[2][-1]
                 along = along if along @ tangent >= 0.0 else -along
                 return self.point(new, matrix, along, unknowns, change, iteration)
-        return DIVERGES
+        raise NoPoint(DIVERGES)
 
     def point(
         self,
@@ -253,13 +253,12 @@ class Continuation(NamedTuple):
         steps: int,
     ) -> Point:
         """The point with these unknowns, after the last step of Newton's method, their `change`."""
-        search, span = self.orbit.search, self.last - self.first
-        state, moved = np.array(new.start), np.zeros(len(new.start))
-        moved[list(search.free)] = change[:-1] * self.scale
-        state[list(search.free)] = unknowns[:-1] * self.scale
-        value = float(unknowns[-1]) * span
-        period = new.time + new.time_by_state @ moved + new.time_by_number * change[-1] * span
-        values = np.linalg.eigvals(new.by_state).astype(complex)
+        search, (*moved, value) = self.orbit.search, unknowns * self.units
+        free, jacobian, span = list(search.free), np.asarray(new.by)[:, :-1], self.last - self.first
+        state, last_step = np.array(new.start), np.zeros(len(new.start) + 1)
+        state[free], last_step[[*free, -1]] = moved, change * self.units
+        period = new.time + new.time_by @ last_step
+        values = np.linalg.eigvals(jacobian).astype(complex)
         values = values[np.argsort(-np.abs(values), kind="stable")]
         pairs = (values[:, None] * values)[np.triu_indices(len(values), 1)]
         # The multipliers of conservative motions come in pairs whose product is 1.
@@ -271,7 +270,7 @@ class Continuation(NamedTuple):
         multipliers = values[: len(values) - (not search.is_driven)]
         error = max(5.0 * float(np.abs(change).max()), 1e-14) * self.scale
         numbers = {search.horizon: period / self.returns} if search.is_driven else {}
-        numbers |= dict.fromkeys(self.others, value) | dict(zip(search.starts, state, strict=True))
+        numbers |= dict.fromkeys(self.others, float(value)) | dict(zip(search.starts, state, strict=True))
         orbit = dataclasses.replace(
             self.orbit,
             period=period,
@@ -283,9 +282,9 @@ class Continuation(NamedTuple):
             leaves=tuple(numbers.get(k, leaf) for k, leaf in enumerate(self.orbit.leaves)),
             returns=self.returns,
         )
-        return Point(unknowns, matrix, tangent, orbit, value, np.asarray(new.by_state), tests, int(new.resets))
+        return Point(unknowns, matrix, tangent, orbit, float(value), jacobian, tests, int(new.resets))
 
-    def between(self, old: Point, new: Point, distance: float) -> Point | int:
+    def between(self, old: Point, new: Point, distance: float) -> Point:
         """The point that cubic interpolation gives: near a branch point, Newton's method may converge to the other branch."""
         length = float(old.tangent @ (new.unknowns - old.unknowns))
         slope, chord = new.tangent / (new.tangent @ old.tangent), (new.unknowns - old.unknowns) / length
@@ -294,11 +293,9 @@ class Continuation(NamedTuple):
         tangent = old.tangent + 2.0 * part * bend + 3.0 * part**2 * twist
         unknowns = old.unknowns + distance * (old.tangent + part * bend + part**2 * twist)
         returns, matrix, moved = self.linearized(unknowns)
-        if returns.reason > 0 or not np.isfinite(matrix).all():
-            return int(returns.reason) or DIVERGES
         return self.point(returns, matrix, tangent / np.linalg.norm(tangent), moved, np.zeros_like(moved), 0)
 
-    def located(self, old: Point, new: Point, length: float, test: int) -> tuple[float, Point] | None:
+    def located(self, old: Point, new: Point, length: float, test: int) -> tuple[float, Point]:
         """Where a test function vanishes between two points: the distance from the first, and the point."""
         from scipy.optimize import brentq
 
@@ -308,33 +305,30 @@ class Continuation(NamedTuple):
             if distance not in points:
                 is_crossing = test == KINDS.index(CROSSING)
                 guess = old.unknowns + distance * old.tangent
-                point = self.between(old, new, distance) if is_crossing else self.corrected(guess, old.tangent)
-                if isinstance(point, int):
-                    raise ArithmeticError
-                points[distance] = point
+                points[distance] = (
+                    self.between(old, new, distance) if is_crossing else self.corrected(guess, old.tangent)
+                )
             return float(points[distance].tests[test])
 
         if abs(new.tests[test]) <= NO_SIGN:
             return length, new
-        try:
-            root: float = brentq(value, 0.0, length, xtol=1e-13)  # type: ignore[assignment]
-            value(root)
-        except ArithmeticError:
-            return None
+        root: float = brentq(value, 0.0, length, xtol=1e-13)  # type: ignore[assignment]
+        value(root)
         return root, points[root]
 
-    def specials(self, old: Point, new: Point, length: float) -> list[tuple[float, int, Point]] | None:
-        """The zeros of the test functions between two points, in order; `None` if one cannot be located."""
+    def specials(self, old: Point, new: Point, length: float) -> list[tuple[float, int, Point]]:
+        """The zeros of the test functions between two points, in order; raises `NoPoint` if one cannot be located."""
         zeros = []
         for test, (before, after) in enumerate(zip(old.tests, new.tests, strict=True)):
             if abs(before) <= NO_SIGN or (abs(after) > NO_SIGN and before * after > 0.0):
                 continue
-            zero = self.located(old, new, length, test)
-            if zero is None:
-                return None
+            try:
+                distance, point = self.located(old, new, length, test)
+            except NoPoint:
+                raise NoPoint(DIVERGES) from None
             # Two real multipliers whose product is 1 are no Neimark-Sacker point.
-            if test != KINDS.index(TORUS) or is_rotating(zero[1].orbit.multipliers):
-                zeros.append((zero[0], test, zero[1]))
+            if test != KINDS.index(TORUS) or is_rotating(point.orbit.multipliers):
+                zeros.append((distance, test, point))
         return sorted(zeros, key=lambda zero: zero[:2])
 
     def followed(self, step: float, count: int) -> "tuple[list[Point], list[str], str]":
@@ -344,23 +338,25 @@ class Continuation(NamedTuple):
         singular = np.linalg.svd(self.linearized(begin)[1], compute_uv=False)
         if singular[len(begin) - 2] <= RANK * max(1.0, singular[0]):
             raise ValueError(OF_A_FAMILY)
-        start = self.corrected(begin, np.eye(len(begin))[-1])
-        if isinstance(start, int):
-            raise ValueError(f"the orbit: there is no branch from {self.first:.10g}: {end_of(start)}")
-        points, kinds, length, is_free = [start], [REGULAR], 0.25 * step, True
-        problem = 0
+        try:
+            points = [self.corrected(begin, np.eye(len(begin))[-1])]
+        except NoPoint as error:
+            raise ValueError(f"the orbit: there is no branch from {self.first:.10g}: {error}") from None
+        kinds, length, is_free = [REGULAR], 0.25 * step, True
         while len(points) < count:
             old = points[-1]
-            new = self.corrected(old.unknowns + length * old.tangent, old.tangent)
-            problem = new if isinstance(new, int) else CHANGES if new.resets != old.resets else 0
-            zeros = None
-            if not isinstance(new, int) and not problem and new.tangent @ old.tangent >= STRAIGHT:
+            try:
+                new = self.corrected(old.unknowns + length * old.tangent, old.tangent)
+                if new.resets != old.resets:
+                    raise NoPoint(CHANGES)
+                if new.tangent @ old.tangent < STRAIGHT:
+                    raise NoPoint(DIVERGES)
                 zeros = self.specials(old, new, length)
-            if isinstance(new, int) or zeros is None:
+            except NoPoint as error:
                 length, is_free = 0.5 * length, False
                 if length < SMALLEST * step:
-                    kinds[-1] = GRAZING if problem in (7, CHANGES) else kinds[-1]
-                    return points, kinds, end_of(problem or DIVERGES)
+                    kinds[-1] = GRAZING if error.reason in (7, CHANGES) else kinds[-1]
+                    return points, kinds, str(error)
                 continue
             for _, test, point in zeros:
                 if test >= len(KINDS):
