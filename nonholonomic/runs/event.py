@@ -24,7 +24,7 @@ from ..integration import AbstractProblem, ExtendedProblem, Lanes, Outcome, Sett
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_run
 from ..parameters import Parameters
 from ..terminal import status_line
-from ..text import described, gathered, likely, name_of, shown
+from ..text import described, gathered, likely, shown
 from ..validation import UNTRACEABLE, as_number, explaining, is_traced, nan_unless, warn
 from .model import AbstractModel, Names, Number, Start, check_run, model_of, require_event, settings_for_lanes
 
@@ -79,11 +79,6 @@ class EventFunction(eqx.Module):
     def function(self) -> Any:
         """The user's function, with its present numbers."""
         return self.parameters.tree["event"].event
-
-    @property
-    def name(self) -> str:
-        """The name of the function, for the request of a table."""
-        return name_of(self.function)
 
 
 def rows_of(model: AbstractModel, names: Names) -> jax.ShapeDtypeStruct:
@@ -295,16 +290,13 @@ class Ensemble(eqx.Module):
     """The runs of many cells of a model.
 
     - `problem`: the motion of smooth runs; `None` for other runs.
-    - `modes`, `first`, `states`: the modes, the index of each cell's first mode, and the initial states; `None` for
-      smooth runs.
+    - `start`: the modes, the index of each cell's first mode, and the initial states; `None` for smooth runs.
     - `counters`: number of counters; `continues`: whether a run continues through its event.
     """
 
     problem: AbstractProblem | None
-    # A tuple and two arrays, or `None`.
-    modes: Any
-    first: Any
-    states: Any
+    # A `Start`, or `None`.
+    start: Any
     counters: int = eqx.field(static=True)
     continues: bool = eqx.field(static=True)
 
@@ -312,8 +304,8 @@ class Ensemble(eqx.Module):
     def of(cls, model: AbstractModel, cells: int, tolerance: Number, continues: bool) -> "Ensemble":
         """The runs of some cells of a model, whose numbers are scalars or arrays with one number per cell."""
         if model.smooth:
-            return cls(problem_of(model, cells, ()), None, None, None, 0, continues)
-        return cls(None, *modes_of(model, cells, tolerance, (), continues), len(model.counters), continues)
+            return cls(problem_of(model, cells, ()), None, 0, continues)
+        return cls(None, modes_of(model, cells, tolerance, (), continues), len(model.counters), continues)
 
     def nudged(self, share: float) -> "Ensemble":
         """The runs with resets from initial states whose components are larger by a share; smooth runs stay as they are."""
@@ -328,8 +320,9 @@ class Ensemble(eqx.Module):
         if self.problem is not None:
             arguments = (self.problem, jnp.asarray(t1), jnp.asarray(cells), settings)
             return solve_ensemble(*arguments, nonterminal=self.continues, one_kernel=True, traced=traced)[0]
+        modes, first, states = self.start
         options = {"counters": self.counters, "nonterminal": self.continues, "traced": traced}
-        return solve_hybrid(self.modes, self.first, self.states, t1, cells, settings, **options)
+        return solve_hybrid(modes, first, states, t1, cells, settings, **options)
 
     def solve_with_tangents(
         self,
@@ -357,16 +350,16 @@ class Ensemble(eqx.Module):
             # The derivatives need the run only up to the event, whose time is known.
             outcome = self.solve(t1, cells, settings, traced)
             t1 = xp.where(xp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
-        pairs = tuple((tangent.modes, tangent.states) for tangent in tangents)
+        modes, first, states = self.start
+        pairs = tuple((tangent.start[0], tangent.start[2]) for tangent in tangents)
         options = {"counters": self.counters, "ends_on_event": not self.continues, "traced": traced}
-        arguments = (self.modes, pairs, self.first, self.states, t1, cells, settings)
-        run, sensitivities = solve_hybrid_with_tangents(*arguments, **options)
+        run, sensitivities = solve_hybrid_with_tangents(modes, pairs, first, states, t1, cells, settings, **options)
         return run if outcome is None else outcome, sensitivities.slopes, sensitivities.grazing
 
     @property
     def starts(self) -> Float[Array, "components cells"]:
         """The initial states."""
-        return self.problem.start()[0] if self.problem is not None else jnp.asarray(self.states)
+        return self.problem.start()[0] if self.problem is not None else jnp.asarray(self.start[2])
 
 
 def counted(model: AbstractModel, outcome: Outcome | HybridOutcome) -> dict[str, Any]:
@@ -385,7 +378,7 @@ def status_of(model: AbstractModel, ensemble: Ensemble, outcome: Any, tolerance:
             value: Any = ensemble.problem.event_function(state)
         else:
             value = jnp.ones(state.shape[1])
-            for number, mode in enumerate(ensemble.modes or ()):
+            for number, mode in enumerate(ensemble.start[0]):
                 beyond: Any = mode.problem(state).event_function(state)
                 value = jnp.where(outcome.mode == number, beyond, value)
         has_event = (outcome.status == REACHED_END) & (value <= 0.0) & jnp.isfinite(outcome.crossing_time)

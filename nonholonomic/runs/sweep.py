@@ -25,7 +25,7 @@ from ..sweeps.grid import EQUATIONS, SHOWN_IN, columns
 from ..sweeps.table import cells_with
 from ..text import likely, shown, unit_of
 from ..validation import as_number, explaining, require_flag, require_outside, require_whole, warn
-from .event import Ensemble
+from .event import modes_of
 from .model import AbstractModel, AbstractSceneModel, Number, check_horizon, model_of, require_event, settings_for_lanes
 from .simulate import Samples
 from .table import TableForm, TableJob
@@ -58,15 +58,13 @@ def checksum_of(model: AbstractModel) -> str:
     arrays, static = eqx.partition(model, eqx.is_array)
 
     def equations(arrays: Any) -> list[Any]:
-        ensemble = Ensemble.of(eqx.combine(arrays, static), 1, jnp.asarray(1e-9), False)
-        state, time = ensemble.starts, jnp.zeros(1)
-        modes = ensemble.modes or ()
-        problems = [ensemble.problem] if ensemble.problem is not None else [mode.problem(state) for mode in modes]
-        parts: list[Any] = [
-            (problem.field(time, state), problem.event_function(state), problem.domain_margin(time, state))
-            for problem in problems
-        ]
-        return [*parts, *(mode.reset_map(state, jnp.ones(1)) for mode in modes)]
+        modes, _, state = modes_of(eqx.combine(arrays, static), 1, jnp.asarray(1e-9), ())
+        parts, time = [], jnp.zeros(1)
+        for mode in modes:
+            problem = mode.problem(state)
+            values = (problem.field(time, state), problem.event_function(state), problem.domain_margin(time, state))
+            parts += [values, mode.reset_map(state, jnp.ones(1))]
+        return parts
 
     program = jax.make_jaxpr(equations)(arrays)
     checksum = hashlib.sha256(ADDRESS.sub("", str(program)).encode())

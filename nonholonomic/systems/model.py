@@ -53,17 +53,30 @@ class OwnModel(AbstractModel):
     event: None = None
     draw: Draw = eqx.field(static=True, default=None)
     has_balance: bool = eqx.field(static=True, default=False)
+    smooth: bool = eqx.field(static=True, kw_only=True)
+    has_event: bool = eqx.field(static=True, kw_only=True)
+    depends_on_time: bool = eqx.field(static=True, kw_only=True)
+    compiles_slowly: bool = eqx.field(static=True, kw_only=True)
 
     @classmethod
     def of(cls, tree: dict[str, Any], draw: Draw = None) -> "OwnModel":
         """The model of a system, its start, its event and its drawing."""
         hybrid, state = assembled(tree)
         form = Form.of(hybrid, state.size)[0]
-        form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
-        system = tree["system"]
+        # Traced here, so that what is wrong with a user's function is said before anything compiles.
+        traits, system = form.traits, tree["system"]
         has_balance = mechanics.is_driven(system) or tree["input"] is not None
-        named = {"names": names_of(system, form.size, has_balance), "has_balance": has_balance}
-        return cls(parameters=Parameters.of(tree), form=form, draw=draw, **named)
+        return cls(
+            parameters=Parameters.of(tree),
+            form=form,
+            names=names_of(system, form.size, has_balance),
+            draw=draw,
+            has_balance=has_balance,
+            smooth=traits.smooth,
+            has_event=form.has_event,
+            depends_on_time=traits.depends_on_time,
+            compiles_slowly=any(traits.large),
+        )
 
     def __reduce__(self) -> tuple[Function, tuple[dict[str, Any], Draw]]:
         # The structure of a tree with a user's classes cannot be pickled, but the tree can.
@@ -136,22 +149,6 @@ class OwnModel(AbstractModel):
 
     def legal_cells(self, columns: dict[str, Array | np.ndarray]) -> Bool[Array, " cells"]:
         return _all_left(mechanics.rooms(jax.tree.map(np.asarray, _compiled_parts(self.replaced(columns))), np))
-
-    @property
-    def smooth(self) -> bool:
-        return self.form.traits.smooth
-
-    @property
-    def compiles_slowly(self) -> bool:
-        return any(self.form.traits.large)
-
-    @property
-    def has_event(self) -> bool:
-        return self.form.has_event
-
-    @property
-    def depends_on_time(self) -> bool:
-        return self.form.traits.depends_on_time
 
     def reduced(self, rows: Float[Array, "rows cells"], mode: object) -> Float[Array, "components cells"]:
         # Runs keep by how much they violate constraints, so that orbits that violate them would be a family with others.

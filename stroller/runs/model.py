@@ -155,7 +155,7 @@ class RideModel(AbstractSceneModel):
             controls = "none" if controls is None else name_of(controls)
         request = description("scene", self.scene) | description("launch", self.launch) | {"input": controls}
         request |= {"jumps": [float(time) for time in self.jumps]} if self.jumps else {}
-        return request if self.event is None else request | {"event": self.event.name}
+        return request if self.event is None else request | {"event": name_of(self.event.function)}
 
     def check(self) -> None:
         self.scene.check(self.launch)

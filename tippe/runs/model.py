@@ -24,6 +24,7 @@ from nonholonomic.runs.event import EventFunction, with_event
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, Start, model_of, run_of, statuses
 from nonholonomic.runs.table import TableForm
 from nonholonomic.sweeps import Quantity, Variable
+from nonholonomic.text import name_of
 from nonholonomic.validation import Bound, Function, all_bounds, explaining, legal, require_kind, require_scalars
 
 from ..friction import NoSlip
@@ -244,7 +245,7 @@ class TopModel(AbstractSceneModel):
 
     def description(self) -> dict[str, Any]:
         request = {path: value for name, root in self.roots.items() for path, value in description(name, root).items()}
-        return request if self.event is None else request | {"event": self.event.name}
+        return request if self.event is None else request | {"event": name_of(self.event.function)}
 
     def check(self) -> None:
         self.scene.check_start(self.launch)

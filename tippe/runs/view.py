@@ -421,8 +421,8 @@ def theta_over_time(
     model = TopModel.timed(**cells, angle=event_of(scene, None))
     ensemble = Ensemble.of(model, size, settings.tolerance, False)
     # No inclination exceeds pi, so no run ends before its time, in the programs of the table.
-    modes = tuple(dataclasses.replace(mode, cos_angle=jnp.asarray(-1.0)) for mode in ensemble.modes or ())
-    ensemble = dataclasses.replace(ensemble, modes=modes)
+    modes = tuple(dataclasses.replace(mode, cos_angle=jnp.asarray(-1.0)) for mode in ensemble.start[0])
+    ensemble = dataclasses.replace(ensemble, start=(modes, *ensemble.start[1:]))
     parts = -(-len(times) // size)
     ends = np.pad(times, (0, size * parts - len(times)), mode="edge").reshape(size, parts)
     rows, goes = [], np.ones(size, bool)
@@ -432,5 +432,5 @@ def theta_over_time(
         theta = np.asarray(at_the_end(model, ensemble, outcome, settings.tolerance)[1]["end_theta"])
         rows.append(theta if not rows else np.where(goes, theta, rows[-1]))
         goes &= outcome.status == REACHED_END
-        ensemble = dataclasses.replace(ensemble, states=outcome.state, first=outcome.mode)
+        ensemble = dataclasses.replace(ensemble, start=(modes, outcome.mode, outcome.state))
     return np.stack(rows, axis=1).ravel()[: len(times)]
