@@ -21,7 +21,7 @@ from ..compilation.xla_cpu import programs_in
 from ..integration import Settings
 from ..integration.problem import DEFAULT_MAX_STEPS, Status, require_times
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
-from ..sweeps.grid import EQUATIONS, SHOWN_IN, columns
+from ..sweeps.grid import EQUATIONS, FOR_A_TIME, REMARK, SHOWN_IN, columns
 from ..sweeps.table import cells_with
 from ..text import likely, shown, unit_of
 from ..validation import as_number, explaining, require_flag, require_outside, require_whole, warn
@@ -290,7 +290,9 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
     request = job.model.description() | {axis.number: "an axis" for axis in grid} | request
     integrator = job.settings.for_single_runs if job.by_diffrax else job.settings.for_lanes
     request |= {"tolerance": float(options.tolerance), "solver": type(integrator).__name__}
-    request |= {SHOWN_IN: unit_of(job.model)}
+    request |= {SHOWN_IN: unit_of(job.model), REMARK: "" if job.continues else job.form.left_open}
+    if job.crossing == "both" and job.form.named is not None:
+        request[FOR_A_TIME] = [job.form.named[status].word for status in (Status.EVENT, Status.COMPLETED)]
     request |= {"max_steps": int(options.max_steps), "errors": bool(options.errors), "sensitivities": list(slopes)}
     if options.path is not None and has_users_code(job.model.__reduce__()[1]):
         request |= {EQUATIONS: checksum_of(job.model)}

@@ -120,9 +120,8 @@ class TableJob(NamedTuple):
     def _ending(self, ends: dict[str, Variable]) -> dict[str, Variable]:
         """The variables that describe how a run ended."""
         counts = COUNTED | self.model.counters
-        remark = f"; {self.form.left_open}" if self.form.left_open and not self.continues else ""
         of_end = {
-            "status": Variable("1", np.int8, WORDS, long_name=f"how the {self.form.run} ended{remark}"),
+            "status": Variable("1", np.int8, WORDS, long_name=f"how the {self.form.run} ended"),
             "end_time": Variable("s", np.float64, long_name=f"end of the {self.form.run}"),
         }
         return of_end | ends | {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}

@@ -27,8 +27,9 @@ else:
 #: The name of the checksum of a user's equations in a request.
 EQUATIONS = "equations"
 
-#: The name of the units in which texts and pictures show a table, in a request and in the attributes.
-SHOWN_IN = "shown_in"
+#: How texts and pictures show a table, in a request and in the attributes: in which units; with which remark on the statuses;
+#: and, for first and last times, the words for cells whose event holds at the end, and for those where it may have held before.
+SHOWN = SHOWN_IN, REMARK, FOR_A_TIME = "shown_in", "remark", "for_a_time"
 
 #: Code and word for a cell that has not been computed.
 PENDING, UNREACHED = -1, "pending"
@@ -103,11 +104,11 @@ class Layout(NamedTuple):
 
 
 def attributes_of(request: dict[str, object], axes: list[str], default: Any = None) -> dict[str, str]:
-    """The attributes of a table: what was computed, in JSON, over which axes, and with which versions; and in which units it
-    is shown, which is no part of what was computed. **Arguments:** `default`: as for `json.dumps`."""
-    words = json.dumps({name: value for name, value in request.items() if name != SHOWN_IN}, default=default)
-    unit = {SHOWN_IN: json.dumps(request[SHOWN_IN])} if request.get(SHOWN_IN) else {}
-    return {"request": words, "axes": json.dumps(axes), "versions": json.dumps(versions())} | unit
+    """The attributes of a table: what was computed, in JSON, over which axes, and with which versions; and how it is shown.
+    **Arguments:** `default`: as for `json.dumps`."""
+    words = json.dumps({name: value for name, value in request.items() if name not in SHOWN}, default=default)
+    shown = {name: json.dumps(request[name]) for name in SHOWN if request.get(name)}
+    return {"request": words, "axes": json.dumps(axes), "versions": json.dumps(versions())} | shown
 
 
 def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:

@@ -20,7 +20,7 @@ from ..views.pages import Viewable, draw_curves, require_labels, require_others
 from ..views.plot import draw_portrait, draw_series, draw_table, draw_title
 from ..views.stage import curves_in
 from ._store import Stored, contents_of, table_path, write_file
-from .grid import PENDING, SHOWN_IN, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
+from .grid import FOR_A_TIME, PENDING, REMARK, SHOWN_IN, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
 
 if TYPE_CHECKING:
     import pandas
@@ -101,12 +101,14 @@ class Table(eqx.Module):
         return tuple(json.loads(self.attributes.get(SHOWN_IN, "[]")))
 
     @property
-    def inverted_for_a_time(self) -> Values:
-        """Whether the top of each cell was inverted and is not at the end; only a table of both crossings tells, and in
-        others this is false."""
-        if not {"first_time", "status"} <= set(self.variables):
-            return np.zeros(self.shape, bool)
-        return np.isfinite(self.variables["first_time"]) & (self.variables["status"] == "not_inverted")
+    def for_a_time(self) -> tuple[str, Values]:
+        """The words for cells whose event happened and does not hold at the end, and whether each cell is one; only a table of
+        both crossings tells."""
+        words = json.loads(self.attributes.get(FOR_A_TIME, "[]"))
+        if not words or not {"first_time", "status"} <= set(self.variables):
+            return "", np.zeros(self.shape, bool)
+        happened = np.isfinite(self.variables["first_time"])
+        return f"{words[0]} for a time", happened & (self.variables["status"] == words[1])
 
     def label(self, name: str) -> str:
         """The label of a coordinate or variable for plots: its long name with its unit, "inversion time [s]"."""
@@ -360,10 +362,9 @@ class Table(eqx.Module):
             dims = "".join(f" x {dim} ({len(self.coords[dim])})" for dim in self.inner.get(name, ()))
             summary = _summary(values if name == "status" else values[computed])
             if name == "status":
-                count, remark = np.sum(self.inverted_for_a_time), self.long_names.get(name, "").partition("; ")[2]
-                summary += (f", of which {count} inverted for a time" if count else "") + (
-                    f" ({remark})" if remark else ""
-                )
+                (words, cells), remark = self.for_a_time, json.loads(self.attributes.get(REMARK, '""'))
+                summary += f", of which {np.sum(cells)} {words}" if np.any(cells) else ""
+                summary += f" ({remark})" if remark else ""
             rows.append((f"{name}{f' [{unit}]' if unit else ''}{dims}", summary, self.long_names.get(name, "")))
         return title, rows
 

@@ -110,21 +110,21 @@ def draw_table(
     visible = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
     # The statuses of the drawn cells, if each has one.
     has_status = "status" in table.variables and not table.inner.get(variable)
-    words, fell = None, np.zeros(visible.shape, bool)
+    words, (fallen, fell) = None, table.for_a_time
     if has_status:
-        words, fell = (_slice(part, dims, names, cut) for part in (table["status"], table.inverted_for_a_time))
-        words = np.where(fell, "inverted for a time", words)
+        words, fell = (_slice(part, dims, names, cut) for part in (table["status"], fell))
+        words = np.where(fell, fallen, words)
     drawing = new_figure().add_subplot() if ax is None else ax
     cuts = [_cut_text(table, name, place, at.get(name)) for name, place in cut.items()]
     is_diagram = x is None and len(names) == 2 and names[0] == "crossing"
     is_map = len(names) == 2 and not is_diagram and (y is not None or len(table.coords[names[1]]) > MOST_LINES)
     drawing.set_ylabel(table.label(names[1] if is_map else variable))
-    if np.any(marked := fell & np.isfinite(visible)):
-        # Cells with a value whose top was inverted only for a time.
+    if has_status and np.any(marked := fell & np.isfinite(visible)):
+        # Cells with a value whose event held only for a time.
         abscissa = np.broadcast_to(table.coords[names[0]], visible.T.shape).T
         ordinate = np.broadcast_to(table.coords[names[1]], visible.shape) if is_map else visible
         style = {"color": "white", "markeredgecolor": "0.2", "markersize": 6, "linestyle": "", "zorder": 3}
-        drawing.plot(abscissa[marked], ordinate[marked], ".", label="inverted for a time", **style)
+        drawing.plot(abscissa[marked], ordinate[marked], ".", label=fallen, **style)
     if is_map:
         cuts = [label, *cuts] if label else cuts
         _draw_map(drawing, table, names, visible, table.label(variable), log, values.dtype.kind in "iu")

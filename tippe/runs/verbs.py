@@ -287,7 +287,7 @@ def inversion_table(
       above the angle until `t1` (if theta oscillates, first crossings are ill-conditioned), or, for the contact of a
       stem, the time after which the sphere does not touch until `t1`; "both" for both times from one run: the variables
       `first_time` and `last_time` replace `time`, the status is that of the last crossing, and texts and pictures tell
-      tops that were inverted for a time from the others (`table.inverted_for_a_time`).
+      tops that were inverted for a time from the others (`table.for_a_time`).
     - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
     - `axes`: additional axes, name of a parameter -> values. The end of a full name is enough if it is unique, such as
       `{"offset": [0.005, 0.006]}` for `"scene.body.offset"`.

@@ -104,7 +104,8 @@ def test_a_top_that_was_inverted_for_a_time_is_told_from_others():
     first, last = np.array([1.0, 2.0, np.inf]), np.array([1.5, np.inf, np.inf])
     status = np.array(["inverted", "not_inverted", "not_inverted"])
     flat = {"first_time": first, "last_time": last, "status": status, "end_theta": np.array([3.0, 0.1, 0.1])}
-    table = Table({"spin": SPIN[:3]}, flat, {"spin": "rad s-1"}, {})
+    words = {"for_a_time": '["inverted", "not_inverted"]'}
+    table = Table({"spin": SPIN[:3]}, flat, {"spin": "rad s-1"}, words)
     assert "status: 1 inverted, 2 not_inverted, of which 1 inverted for a time\n" in str(table)
     texts = [text.get_text() for text in table.plot("last_time").axes[0].get_legend().get_texts()]
     assert texts == ["inverted for a time", "not inverted"]
@@ -113,7 +114,7 @@ def test_a_top_that_was_inverted_for_a_time_is_told_from_others():
     assert_close(marked.get_xydata(), [[SPIN[1] * 30.0 / np.pi, 2.0]], rtol=1e-12)
     # A map of many more values.
     square = {name: np.broadcast_to(values[:, None], (3, 11)) for name, values in flat.items()}
-    table = Table({"spin": SPIN[:3], "other": SPIN}, square, {}, {})
+    table = Table({"spin": SPIN[:3], "other": SPIN}, square, {}, words)
     (axes, _) = table.plot("first_time").axes
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["inverted for a time", "not inverted"]
     assert_close(axes.get_lines()[0].get_xydata(), np.stack([np.full(11, SPIN[1]), SPIN], axis=-1))
