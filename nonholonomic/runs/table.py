@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from ..derivatives import tangent_scale, tangents_of
+from ..derivatives import tangent_scale, tangents_by
 from ..hybrid import HybridOutcome
 from ..integration import Outcome, Settings, solve_by_diffrax
 from ..integration.problem import TIGHTEST, TIGHTEST_IN_SINGLE, Status
@@ -272,18 +272,14 @@ def _with_tangents(
 ) -> tuple[Ensemble, tuple[Any, ...], list[Float[Array, "..."]]]:
     """The runs of all cells, the tangents along the named parameters, and the scale of each tangent."""
 
-    def build(*moving: Array) -> Ensemble:
-        cells = model.replaced(columns | dict(zip(names, moving, strict=True)))
-        return Ensemble.of(cells, size, tolerance, continues)
+    def build(values: tuple[Array, ...], _: int | None) -> Ensemble:
+        moved = model.replaced(columns | dict(zip(names, values, strict=True)))
+        return Ensemble.of(moved, size, tolerance, continues)
 
     cells = model.replaced(columns)
     point = tuple(jnp.asarray(cells.value(name), float) for name in names)
-    scales = [tangent_scale(value) for value in point]
-    tangents = [
-        tuple(scale if row == k else jnp.zeros_like(scale) for k, scale in enumerate(scales))
-        for row in range(len(names))
-    ]
-    return build(*point), tangents_of(build, point, tangents), scales
+    ensemble, tangents, _ = tangents_by(build, tuple(range(len(names))), point, size)
+    return ensemble, tangents, [tangent_scale(value) for value in point]
 
 
 # Error bounds for a table, from two more runs of each cell at smaller tolerances.

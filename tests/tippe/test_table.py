@@ -86,14 +86,14 @@ def test_a_table_takes_a_launch(rutstam_scene_module):
 
 
 def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, rutstam_scene_module, tmp_path):
-    """A file of another limit is another request; the default limit is not in the request, so that older files resume."""
+    """A file of another limit is another request."""
     arguments = {"theta": THETA, "spin": SPIN, "t1": 12.0, "path": tmp_path / "table.h5"}
     with pytest.warns(UserWarning, match=r"6 of 6 runs have failed: t1 = 12 s is too long: .* more than 40 steps"):
         short_table = tippe.inversion_table(rutstam_scene_module, max_steps=40, **arguments)
     assert (short_table.status == "failed").all()
     assert (short_table["steps"] == 40).all()
     assert json.loads(short_table.attributes["request"])["max_steps"] == 40
-    assert "max_steps" not in json.loads(table.attributes["request"])
+    assert json.loads(table.attributes["request"])["max_steps"] == 2_000_000
     with pytest.raises(ValueError, match="max_steps is 40 in the file"):
         tippe.inversion_table(rutstam_scene_module, **arguments)
 
