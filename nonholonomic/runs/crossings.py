@@ -24,7 +24,7 @@ from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, 
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ..integration.scheduler import InLanes, LaneScheduler, Recorder, of_cells
 from ..integration.step import try_step
-from ..sweeps import Axis, Table, Variable
+from ..sweeps import Table, Variable
 from ..text import shown
 from ..validation import explaining, require_outside, require_whole
 from .event import counted, modes_of, near_zero, problem_of
@@ -224,19 +224,14 @@ class Crossings(Samples):
     """The crossings in a table: their numbers, counted from 1, in place of times; the names of the quantities; and whether the
     states are those after the resets at the section."""
 
+    along = ("crossing", "1")
+
     after: bool = False
 
     def variables(self, model: AbstractModel) -> dict[str, Variable]:
         """The variables of the table with the times and the quantities."""
-        variables = {"time": Variable("s", np.float64, inner=("crossing",), long_name="time of the crossing")}
-        return variables | {
-            name: variable._replace(inner=("crossing", *variable.inner[1:]))
-            for name, variable in super().variables(model).items()
-        }
-
-    def inner(self, model: AbstractModel) -> list[Axis]:
-        """The dimensions of these variables."""
-        return [Axis("crossing", "crossing", "1", self.times.astype(int), "crossing"), *super().inner(model)[1:]]
+        time = Variable("s", np.float64, inner=("crossing",), long_name="time of the crossing")
+        return {"time": time} | super().variables(model)
 
     def solve(
         self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
@@ -347,6 +342,6 @@ def crossings(
     names = model.names if quantities is None else quantities
     require_names(model.quantities, names)
     options = Options(tolerance, solver, max_steps, scattered, False, (), path, progress, executor)
-    samples = Crossings(np.arange(skip + 1.0, skip + count + 1.0), tuple(names), side == "after")
+    samples = Crossings(np.arange(skip + 1, skip + count + 1), tuple(names), side == "after")
     crossing = "after" if side == "after" else "first"
     return table_of(model, {} if axes is None else axes, t1, options, crossing, samples=samples, timed=False)

@@ -2,21 +2,21 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from ..compilation.xla_cpu import compiled_alone, compiled_for_one
 from ..derivatives import SampledRun, sampled_run
 from ..hybrid import HybridOutcome, hybrid_samples, solve_hybrid_with_samples
 from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
 from ..integration.problem import Status, legal_run, require_times
-from ..sweeps import Axis, Variable, axis
+from ..sweeps import Axis, Variable
 from ..terminal import status_line
 from ..validation import as_known, as_number, explaining, is_traced, nan_unless, warn
 from .event import counted, modes_of, problem_of
@@ -34,7 +34,10 @@ DENSE = 1000
 class Samples:
     """The samples in a table: the times [s], and the names of the quantities."""
 
-    times: Float[np.ndarray, " times"]
+    #: The name and the unit of the axis along the samples.
+    along: ClassVar[tuple[str, str]] = ("time", "s")
+
+    times: Num[np.ndarray, " times"]
     names: tuple[str, ...]
 
     def variables(self, model: AbstractModel) -> dict[str, Variable]:
@@ -42,7 +45,7 @@ class Samples:
         variables = {}
         for name in self.names:
             unit, long_name, components, *_ = model.quantities[name]
-            dims = ("time",) if components is None else ("time", components)
+            dims = (self.along[0], components) if components else self.along[:1]
             variables[name] = Variable(unit, np.float64, inner=dims, long_name=long_name)
         return variables
 
@@ -50,7 +53,8 @@ class Samples:
         """The dimensions of these variables."""
         dims = dict.fromkeys(model.quantities[name].components for name in self.names)
         vectors = [Axis(dim, dim, "1", np.array(model.components[dim])) for dim in dims if dim is not None]
-        return [axis("time", "time", "s", self.times, "time"), *vectors]
+        name, unit = self.along
+        return [Axis(name, name, unit, self.times, name), *vectors]
 
     def solve(
         self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
