@@ -309,7 +309,10 @@ class Ensemble(eqx.Module):
 
     def nudged(self, share: float) -> "Ensemble":
         """The runs with resets from initial states whose components are larger by a share; smooth runs stay as they are."""
-        return self if self.states is None else dataclasses.replace(self, states=self.states * (1.0 + share))
+        if self.start is None:
+            return self
+        *modes, states = self.start
+        return dataclasses.replace(self, start=(*modes, states * (1.0 + share)))
 
     def solve(self, t1: Any, cells: Any, settings: Settings, traced: bool = False) -> Outcome | HybridOutcome:
         """The outcome of the runs.
