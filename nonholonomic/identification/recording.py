@@ -201,19 +201,18 @@ class AbstractRecording(AbstractData):
             if np.ndim(self.student) != 0:
                 raise ValueError(f"student must be one number, not of shape {np.shape(self.student)}")
         # Unusual units: samples too far apart for seconds, and angles too large for radians.
-        errors = np.where(seen, 0.0 if self.error is None else self.error, 0.0)
-        for k, name in enumerate(self.columns):
-            largest = np.max(errors.reshape(len(times), -1)[:, k])
-            if self.quantities.units.get(name) == "rad" and largest > LARGE_ERROR:
-                warn(f"error of {name} = {largest:g} rad is large{IN_DEGREES.format(f'{largest:g}')}")
         if self.quantities.usual and len(times) > 1 and (apart := np.median(np.diff(times))) > FAR_APART:
             warn(f"times: samples are {apart:g} s apart; times are in seconds: did you mean 1e-3 * times?")
-        samples = np.abs(np.asarray(self.value)).reshape(len(times), -1)
-        for name in (name for name in self.quantities.usual if name in self.columns):
-            largest = np.nanmax(samples[:, self.columns.index(name)], initial=0.0)
-            if largest > self.quantities.usual[name]:
+        errors, samples = (
+            np.max(np.where(seen, np.abs(numbers), 0.0).reshape(len(times), -1), axis=0)
+            for numbers in (0.0 if self.error is None else np.asarray(self.error), np.asarray(self.value))
+        )
+        for name, error, sample in zip(self.columns, errors, samples, strict=True):
+            if self.quantities.units.get(name) == "rad" and error > LARGE_ERROR:
+                warn(f"error of {name} = {error:g} rad is large{IN_DEGREES.format(f'{error:g}')}")
+            if sample > self.quantities.usual.get(name, math.inf):
                 warn(
-                    f"{name} = {largest:g} rad is large; recorded angles are in radians: did you mean np.radians({name})?"
+                    f"{name} = {sample:g} rad is large; recorded angles are in radians: did you mean np.radians({name})?"
                 )
 
     @property
