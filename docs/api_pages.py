@@ -207,8 +207,7 @@ MEMBERS = {
     "tippe.Trajectory": f"at {RUN} {TOP} contact normal_spin reaction grip",
     "tippe.HybridTrajectory": f"at {RUN} {TOP}",
     "stroller.Scene": "state energy work contact",
-    "stroller.Trajectory": f"{RUN} status energy_residual wheelbase_error grip grip_margin contact_lost_at rank_lost_at "
-    "jackknifed_at",
+    "stroller.Trajectory": f"{RUN} status energy_residual grip grip_margin contact_lost_at rank_lost_at jackknifed_at",
     "stroller.Motion": "position heading steering speed front_speed yaw_rate steering_rate",
     "tippe.Status": "word of",
     "tippe.Table": "shape dims load save to_xarray to_dataframe plot digits",

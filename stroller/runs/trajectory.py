@@ -91,6 +91,7 @@ FURTHER: dict[str, Callable[[RideState], PyTree[Array]]] = {
     "power": lambda state: state.power,
     "constraint": lambda state: state.vector(side_slip(state)),
     "departure": lambda state: state.number(state.scene.surface.offset(state.motion.position)),
+    "wheelbase_error": lambda state: jnp.abs(state.number(relative_curvature(state))) / 6.0,
     "state": lambda state: jnp.moveaxis(state.integrated, 0, -1),
 }
 
@@ -109,6 +110,12 @@ def grip(side_force: Float[Array, "... 2"], load: Float[Array, "... 2"]) -> Floa
     """Coefficient of friction that each axle needs to avoid slip; infinite for a force without a load."""
     force = jnp.abs(side_force)
     return jnp.where(force == 0.0, 0.0, force / jnp.maximum(load, 0.0))
+
+
+def relative_curvature(ride: RideState) -> Component:
+    """Gaussian curvature of the ground, times the square of the wheelbase."""
+    wheelbase = ride.scene.body.wheelbase
+    return multiply(ride.scene.surface.gaussian_curvature(ride.motion.position), wheelbase**2)
 
 
 def side_slip(ride: RideState) -> tuple[Component, Component]:
@@ -294,6 +301,9 @@ class Trajectory(AbstractRun):
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
     - `departure`: distance of the position from the ground [m], an integration error;
+    - `wheelbase_error`: relative error |K| l^2 / 6 of replacing the ground, of Gaussian curvature K, by its tangent plane over
+      the wheelbase l (`stroller.md`, section 9). The model holds if the wheelbase is short compared with the radii of
+      curvature;
     - `stats` of the integration; `model`: its `scene`, `launch` and `input`; `spec`: the model, the horizon and the settings;
       `steps`: the ends of the steps, `None` for a run inside a transformation; if you request events of such a run, the
       run is repeated.
@@ -346,21 +356,7 @@ class Trajectory(AbstractRun):
     @property
     def energy_residual(self) -> Float[Array, " times"]:
         """Energy minus the initial energy and the work since the start [J]: zero for an exact solution."""
-        return self.energy - self.energy[0] - (self.work - self.work[0])
-
-    @property
-    def wheelbase_error(self) -> Float[Array, " times"]:
-        """Relative error |K| l^2 / 6 of replacing the ground by its tangent plane over the wheelbase l.
-
-        K is the Gaussian curvature (`stroller.md`, section 9). The model holds if the wheelbase is short compared with
-        the radii of curvature.
-        """
-        if jnp.ndim(self.t) > 1:
-            return eqx.filter_vmap(lambda run: run.wheelbase_error)(self)
-        scene = self.model.scene
-        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(self.state.T)[0])
-        error = 0.0 if curvature is None else jnp.abs(curvature) * scene.body.wheelbase**2 / 6.0
-        return jnp.broadcast_to(error, self.t.shape)
+        return self.energy - self.energy[..., :1] - (self.work - self.work[..., :1])
 
     def grip(self) -> Float[Array, "times 2"]:
         """Coefficient of friction that each axle needs to avoid slip; infinite for a force without a load."""

@@ -178,6 +178,8 @@ def test_the_error_of_the_wheelbase_on_a_sphere_is_that_of_its_curvature():
     np.testing.assert_allclose(run(1.0).wheelbase_error, np.full(2, expected), rtol=1e-9)
     batch = jax.vmap(run)(jnp.array([0.5, 1.0, 1.5]))
     np.testing.assert_allclose(batch.wheelbase_error, np.full((3, 2), expected), rtol=1e-9)
+    # Each run of a batch is compared with its own start.
+    np.testing.assert_allclose(batch.energy_residual, 0.0, atol=1e-7)
 
 
 @pytest.mark.slow
