@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic import __version__, views
@@ -18,6 +19,7 @@ from nonholonomic.command_line import run_and_exit
 from nonholonomic.compilation.cache import are_kept, enable_compilation_cache, kept_files
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
+from nonholonomic.sweeps import run_table
 from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import Bound, Bounded, as_number, replacing, require_folder
 
@@ -28,7 +30,7 @@ from .model.scene import FORKS, Launch, Scene
 from .planning.plan import Plan, plan, planned_stage
 from .planning.problem import Box, Goal, Limits
 from .runs.model import simulate
-from .runs.trajectory import Trajectory, table_of
+from .runs.trajectory import QUANTITIES, VECTORS, Trajectory
 from .runs.view import stage_of_rides
 
 RIDES = ("without friction", "with friction")
@@ -213,12 +215,17 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
     parking, *rides_by_ground = results
     rides = {name: run for runs in rides_by_ground for name, run in runs.items()}
     names = ["_".join(name).replace(" ", "_") for name in rides]
-    request = {name: value for name, value in vars(options).items() if name != "out"}
+    facts = vars(options) | {"ride": names}
+    request: dict[str, object] = {name: fact for name, fact in facts.items() if name != "out"}
     with status_line("drawing"):
-        table_of(list(rides.values()), names, request | {"ride": names}).save(options.out / "rides.h5")
+        first, *others = rides.values()
+        # Every ground has coordinates of its own.
+        axes = {"ride": names, "time": first.t} | VECTORS | {"coordinate": ("first", "second")}
+        coords = {dim: np.array(labels) for dim, labels in axes.items()}
+        values = {name: np.stack([run[name] for run in rides.values()]) for name in QUANTITIES}
+        run_table(QUANTITIES, coords, values, ["ride", "time"], request).save(options.out / "rides.h5")
         files, pictures = ["rides.h5"], []
         if views.can_draw():
-            first, *others = rides.values()
             labels = [", ".join(name) for name in rides]
             curves = first.plot("speed", "energy", "side_force", others=others, label=labels)
             for heading, name, figure in (

@@ -120,7 +120,6 @@ def check_input(controls: Any, scene: Any, launch: Any, jumps: Any = None) -> No
     - `scene`, `launch`: scene and launch of the ride, with concrete or traced numbers.
     - `jumps`: times at which the input jumps, or `None`.
     """
-    as_jumps(jumps)
     if controls is None:
         if jumps is not None:
             raise ValueError(f"jumps = {shown(jumps)} must be None without an input: the input is what jumps")

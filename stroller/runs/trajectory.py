@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from nonholonomic import validation
 from nonholonomic.compilation.xla_cpu import compiled_quickly
-from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
+from nonholonomic.geometry import Component, dot, multiply, scale, sum_vectors
 from nonholonomic.integration import ImplicitMidpoint, Settings, explicit_tableau, follow, sample
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import REACHED_END, require_adaptive, require_adjoint, require_times
@@ -138,29 +138,6 @@ def side_slip(ride: RideState) -> tuple[Component, Component]:
     sideways = sum_vectors(scale(-g.sine, heading), scale(g.cosine, left))
     front = sum_vectors(velocity, scale(multiply(scene.body.wheelbase, dot(heading_rate, left)), left))
     return dot(velocity, left), dot(front, sideways)
-
-
-def table_of(runs: list[Any], names: list[str], request: dict[str, Any], only: Sequence[str] = ()) -> Table:
-    """All quantities of several runs with the same times, over these times.
-
-    **Arguments:**
-
-    - `runs`: the trajectories.
-    - `names`: names of the runs, without spaces, for the axis "ride"; empty for a single run.
-    - `request`: plain data that describes the computation.
-    - `only`: names of quantities, as for `chosen`.
-    """
-    flat = {isinstance(run.model.scene.surface, Plane) for run in runs}
-    # On grounds of different kinds, a place has no common unit.
-    places, unit = {True: (("x", "y"), "m"), False: (("mu", "eta"), "rad")}[flat.pop()]
-    places, unit = (("first", "second"), "m or rad") if flat else (places, unit)
-    coords = {"ride": np.array(names)} if names else {}
-    coords |= {"time": np.asarray(runs[0].t), "coordinate": np.array(places)}
-    coords |= {dim: np.array(names) for dim, names in VECTORS.items()}
-    quantities = chosen(QUANTITIES | {"place": QUANTITIES["place"]._replace(unit=unit)}, only)
-    of_runs = {name: [np.asarray(run[name]) for run in runs] for name in quantities}
-    values = {name: np.stack(of_each) if names else of_each[0] for name, of_each in of_runs.items()}
-    return run_table(quantities, coords, values, [*(["ride"] if names else []), "time"], request)
 
 
 # The steps of a ride, the states between them, found by repeating a step with another length, and zero crossings.
@@ -454,7 +431,13 @@ class Trajectory(AbstractRun):
 
     def table_of(self, names: Sequence[str]) -> Table:
         validation.require_one_run(self, "to_table", "; stroller.sweep makes a table of many")
-        return table_of([self], [], self.model.description() | {"status": self.status}, names)
+        units = {unit for _, unit in self.model.scene.surface.coordinates}
+        place = QUANTITIES["place"]._replace(unit=units.pop()) if len(units) == 1 else QUANTITIES["place"]
+        quantities = chosen(QUANTITIES | {"place": place}, names)
+        coords = {"time": np.asarray(self.t)}
+        coords |= {dim: np.array(parts) for dim, parts in self.model.components.items()}
+        values = {name: np.asarray(self[name]) for name in quantities}
+        return run_table(quantities, coords, values, ["time"], self.model.description() | {"status": self.status})
 
     def labels_of(self, runs: list[Any], unit: Unit) -> list[str]:
         """Names of rides, by what differs in their durations, scenes and launches."""

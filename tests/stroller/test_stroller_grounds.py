@@ -191,6 +191,17 @@ def test_a_hill_is_found_from_a_ride_over_it():
     np.testing.assert_allclose(fit.estimates["scene.surface.height.height"], 0.8, atol=1e-5)
 
 
+def test_a_table_names_the_parts_of_a_place_as_the_surface_does():
+    """An implicit ground has three coordinates; a cylinder has two, of different units."""
+    scene = Scene(BODY, Implicit(Ball(2.0, 1.1)))
+    run = stroller.simulate(scene, Launch((0.0, 0.0, -1.1), 0.0, 0.5), 0.1, times=[0.1], tolerance=1e-6)
+    data = run.to_xarray()
+    assert list(data["coordinate"].values) == ["x", "y", "z"]
+    assert data["place"].attrs["units"] == "m"
+    np.testing.assert_array_equal(data["place"], run.place)
+    assert RideModel.of(Scene(BODY, Cylinder(1.2)), LAUNCH, None).components["coordinate"] == ("y", "eta")
+
+
 @pytest.mark.slow
 def test_an_implicit_ground_is_that_with_the_name():
     """Inside a spheroid, from a point in space."""
