@@ -384,7 +384,7 @@ def _guesses(
     rng = np.random.default_rng(seed)
     if planner is not None:
         task = Task.of(problem, problem.distance, problem.t1, problem.clearance)
-        proposal = proposed(planner, task, problem.t1)
+        proposal = proposed(planner, task)
         if proposal is not None:
             yield problem.distance, Candidates(proposal[None], np.full(1, problem.t1))
             starts -= 1

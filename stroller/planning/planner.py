@@ -130,13 +130,13 @@ class Planner(eqx.Module):
         parts = [jnp.stack([*lengths, *turned]), known, *own, each.sum(axis=0), each.max(axis=0, initial=0.0)]
         return self.of_step(jnp.concatenate(parts).astype(jnp.float32)).astype(float)
 
-    def propose(self, task: Task, t1: Numbers, number: Int[Array, ""]) -> tuple[Numbers, Proposal]:
+    def propose(self, task: Task, number: Int[Array, ""]) -> tuple[Numbers, Proposal]:
         """One of the proposals for a problem, and its merit before it."""
         pose, steering, steering_rate, front_speed = task.start
-        duration, change = t1 / DECISIONS, jnp.array([-1.0, 0.0, 1.0])
+        duration, change = task.t1 / DECISIONS, jnp.array([-1.0, 0.0, 1.0])
         low, high, speed = task.low[0], task.high[0], task.speed
         which = jax.nn.one_hot(number, PROPOSALS)
-        fixed = jnp.stack([jnp.log(t1), jnp.log(speed), task.has_heading, task.goal[1] / speed])
+        fixed = jnp.stack([jnp.log(task.t1), jnp.log(speed), task.has_heading, task.goal[1] / speed])
 
         def decision(carry, k):
             pose, latest = carry
@@ -158,19 +158,19 @@ class Planner(eqx.Module):
         first = jnp.stack([steering + steering_rate * duration * change, front_speed + 0.0 * change], axis=1)
         (end, _), (rows, poses) = jax.lax.scan(jax.checkpoint(decision), (pose, first), jnp.arange(DECISIONS))
         proposal = Proposal(jnp.concatenate([first, rows]), poses, end)
-        return merit(task, proposal, t1), proposal
+        return merit(task, proposal), proposal
 
     @eqx.filter_jit
-    def proposals(self, task: Task, t1: Numbers) -> tuple[Float[Array, " proposals"], Proposal]:
+    def proposals(self, task: Task) -> tuple[Float[Array, " proposals"], Proposal]:
         """The merits of all proposals for a problem, and the proposals."""
-        return jax.vmap(functools.partial(self.propose, task, t1))(jnp.arange(PROPOSALS))
+        return jax.vmap(functools.partial(self.propose, task))(jnp.arange(PROPOSALS))
 
 
-def merit(task: Task, proposal: Proposal, t1: Numbers) -> Numbers:
+def merit(task: Task, proposal: Proposal) -> Numbers:
     """How far a proposal is from solving a problem: the weighted squares of what it misses, breaks and spends."""
 
     def at(pose, window, part):
-        return point_residuals(task, pose, motion_at(window, part / PARTS, t1 / DECISIONS))
+        return point_residuals(task, pose, motion_at(window, part / PARTS, task.t1 / DECISIONS))
 
     of_decision = jax.vmap(at, (0, None, 0))
     of_all = jax.vmap(of_decision, (0, 0, None))
@@ -181,7 +181,7 @@ def merit(task: Task, proposal: Proposal, t1: Numbers) -> Numbers:
     return MISSED * missed + BROKEN * broken + SPENT * jnp.sum(effort**2) / DECISIONS
 
 
-def proposed(planner: Planner, task: Task, t1: float) -> Float[np.ndarray, "rows unknowns"] | None:
+def proposed(planner: Planner, task: Task) -> Float[np.ndarray, "rows unknowns"] | None:
     """The best proposal as unknowns of the optimiser (see `transcription.py`); `None` if no proposal is finite. Raises
     `ValueError` if the planner has learned on another kind of ground or with another wheelbase."""
     ground, wheelbase = type(task.dynamics.surface).__name__, float(task.dynamics.body.wheelbase)
@@ -192,7 +192,7 @@ def proposed(planner: Planner, task: Task, t1: float) -> Float[np.ndarray, "rows
         misfit = f"learned with a wheelbase of {planner.wheelbase:g} m, and that of this scene is {wheelbase:g} m"
     if misfit is not None:
         raise ValueError(f"planner: it has {misfit}; learn in this scene")
-    merits, proposals = jax.tree.map(np.asarray, planner.proposals(task, jnp.asarray(t1)))
+    merits, proposals = jax.tree.map(np.asarray, planner.proposals(task))
     best = np.argmin(np.where(np.isfinite(merits), merits, np.inf))
     if not np.isfinite(merits[best]):
         return None
@@ -281,17 +281,17 @@ def learn_planner(
     random = np.random.default_rng(seed)
     with status_line("learning", progress):
         tasks = [drawn_task(scene, problems, random, 0)]
-        planner = Planner.untrained(tasks[0][0], jax.random.key(seed))
+        planner = Planner.untrained(tasks[0], jax.random.key(seed))
         begin = time.perf_counter()
         while time.perf_counter() - begin < DRAWING * seconds or len(tasks) < BATCH * (seconds > 0.0):
             tasks.append(drawn_task(scene, problems, random, len(tasks)))
-        return trained(planner, scene.dynamics, tasks, random, (1.0 - DRAWING) * seconds, progress)
+        return trained(planner, tasks, random, (1.0 - DRAWING) * seconds, progress)
 
 
 def drawn_task(
     scene: Scene, problems: Callable[[np.random.Generator], dict[str, Any]], random: np.random.Generator, number: int
-) -> tuple[Task, float]:
-    """A random problem as the optimiser needs it, and its duration [s]; `number` names the draw in messages."""
+) -> Task:
+    """A random problem as the optimiser needs it; `number` names the draw in messages."""
     parts: object = problems(random)
     try:
         if not isinstance(parts, dict):
@@ -306,27 +306,21 @@ def drawn_task(
         problem = checked_problem(scene, **parts)
     except ValueError as error:
         raise ValueError(f"problems: draw {number}: {error}") from None
-    return Task.of(problem, problem.distance, problem.t1, problem.clearance), problem.t1
+    return Task.of(problem, problem.distance, problem.t1, problem.clearance)
 
 
-def loss(planner: Planner, dynamics: Dynamics, tasks: Task, t1: Float[Array, " tasks"]) -> Float[Array, ""]:
+def loss(planner: Planner, dynamics: Dynamics, tasks: Task) -> Float[Array, ""]:
     """What learning minimises: the mean over all problems of the merit of the best proposal, on a logarithmic scale."""
 
-    def of_one(task: Task, t1: Numbers) -> Numbers:
-        task = eqx.tree_at(lambda task: task.dynamics, task, dynamics, is_leaf=lambda part: part is None)
-        values = jnp.log1p(planner.proposals(task, t1)[0])
+    def of_one(task: Task) -> Numbers:
+        values = jnp.log1p(planner.proposals(dataclasses.replace(task, dynamics=dynamics))[0])
         return values.min() + SHARE * values.mean()
 
-    return jnp.mean(jax.vmap(of_one)(tasks, t1))
+    return jnp.mean(jax.vmap(of_one)(tasks))
 
 
 def trained(
-    planner: Planner,
-    dynamics: Dynamics,
-    tasks: list[tuple[Task, float]],
-    random: np.random.Generator,
-    seconds: float,
-    progress: bool,
+    planner: Planner, tasks: list[Task], random: np.random.Generator, seconds: float, progress: bool
 ) -> Planner:
     """A planner after steps of Adam, for `seconds` after the first step, which compiles."""
     import optax
@@ -334,17 +328,16 @@ def trained(
     if seconds == 0.0:
         return planner
     # As many obstacles in each task, no limit of the grip as one that nothing reaches, and the common dynamics left out.
-    most = [max(len(getattr(task.obstacles, name)) for task, _ in tasks) for name in ("boxes", "radii")]
-    common = {"dynamics": None, "with_grip": any(task.with_grip for task, _ in tasks)}
-    padded = [dataclasses.replace(task, obstacles=task.obstacles.padded(*most), **common) for task, _ in tasks]
+    most = [max(len(getattr(task.obstacles, name)) for task in tasks) for name in ("boxes", "radii")]
+    dynamics, common = tasks[0].dynamics, {"dynamics": None, "with_grip": any(task.with_grip for task in tasks)}
+    padded = [dataclasses.replace(task, obstacles=task.obstacles.padded(*most), **common) for task in tasks]
     pool = jax.tree.map(lambda *parts: np.stack(parts), *padded)
-    times = np.array([t1 for _, t1 in tasks])
     # A drive that went astray has no useful slope.
     optimiser = optax.apply_if_finite(optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam()), 2**31 - 1)
 
     @eqx.filter_jit
-    def step(planner: Planner, state: Any, tasks: Task, t1: Float[Array, " tasks"], rate: Float[Array, ""]) -> Any:
-        value, slopes = eqx.filter_value_and_grad(loss)(planner, dynamics, tasks, t1)
+    def step(planner: Planner, state: Any, tasks: Task, rate: Float[Array, ""]) -> Any:
+        value, slopes = eqx.filter_value_and_grad(loss)(planner, dynamics, tasks)
         change, state = optimiser.update(slopes, state)
         change = jax.tree.map(lambda part: (-rate * part).astype(part.dtype), change)
         return eqx.apply_updates(planner, change), state, value
@@ -356,7 +349,7 @@ def trained(
             chosen = random.choice(len(tasks), BATCH, replace=False)
             rate = RATE * min(1.0, (number + 1) / RISE) * (0.5 + 0.5 * np.cos(np.pi * spent))
             batch = jax.tree.map(lambda part, chosen=chosen: part[chosen], pool)
-            planner, state, value = step(planner, state, batch, jnp.asarray(times[chosen]), jnp.asarray(rate))
+            planner, state, value = step(planner, state, batch, jnp.asarray(rate))
             value, now = float(value), time.perf_counter()
             if number == 0:
                 begin = now

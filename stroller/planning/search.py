@@ -410,23 +410,21 @@ def guess_of(problem: Problem, path: Path) -> tuple[Float[np.ndarray, "rows unkn
         accelerations = [most.get("force", np.inf) / body.mass, most.get("grip", np.inf) * scene.gravity]
         slowest = [way / accelerations[0], way / accelerations[1], body.steering_inertia / most.get("torque", np.inf)]
         t1 = max(way / most.get("speed", np.inf), 2.0 * float(np.sqrt(max(slowest))))
-    points, splines = timed(path, INTERVALS + 1, t1, wheelbase)
+    points, splines = timed(path, t1, wheelbase)
     lifted = poses_at(scene.surface, points) if problem.map is None else np.hstack(problem.seen(points)[:2])
     poses = np.asarray(lifted)[[*range(len(lifted)), -1, -1]]
     return np.concatenate([poses, np.pad(splines, ((1, ORDER - 3), (0, 0)), mode="edge")], axis=1), t1
 
 
-def timed(
-    path: Path, knots: int, t1: float, wheelbase: float
-) -> tuple[Float[np.ndarray, "knots 3"], Float[np.ndarray, "knots 2"]]:
-    """Poses, and running means of the steering angle [rad] and the speed of the front wheel [m/s], at evenly spaced times from
-    0 to `t1`."""
+def timed(path: Path, t1: float, wheelbase: float) -> tuple[Float[np.ndarray, "knots 3"], Float[np.ndarray, "knots 2"]]:
+    """Poses, and running means of the steering angle [rad] and the speed of the front wheel [m/s], at the knots of a plan,
+    from 0 to `t1`."""
     # The sections between changes of direction.
     cuts = [0, *(np.flatnonzero(np.diff(path.direction)) + 1), len(path.direction)]
     lengths = np.array([path.length[a:b].sum() for a, b in zip(cuts, cuts[1:], strict=False)])
     shares = (lengths + CHANGE * wheelbase) / (lengths + CHANGE * wheelbase).sum()
     ends = np.concatenate([[0.0], np.cumsum(shares)])
-    time = np.linspace(0.0, 1.0, knots)
+    time = np.linspace(0.0, 1.0, INTERVALS + 1)
     section = np.clip(np.searchsorted(ends, time, side="right") - 1, 0, len(lengths) - 1)
     # The share of a section's length, and its rate: smooth ramps, and constant speed between.
     part, top = (time - ends[section]) / shares[section], 1.0 / (1.0 - RAMP)

@@ -155,7 +155,7 @@ class Task(eqx.Module):
     - `start`: pose, steering angle, steering rate and front speed of the launch; `goal`: pose and speed.
     - `has_heading`: 1 if the goal has a heading, else 0.
     - `low`, `high`: limits of steering, speed, force, torque and grip.
-    - `clearance`: the distance [m] to keep from obstacles.
+    - `t1`: about the duration [s] of a drive; `clearance`: the distance [m] to keep from obstacles.
     - `length` [m], `speed` [m/s], `force` [N]: units of the residuals.
     - `haste`: weight [1/s] of the duration in the objective; 0 where the duration is given.
     """
@@ -168,6 +168,7 @@ class Task(eqx.Module):
     has_heading: Float[Array, ""]
     low: Float[Array, " limits"]
     high: Float[Array, " limits"]
+    t1: Float[Array, ""]
     clearance: Float[Array, ""]
     length: Float[Array, ""]
     speed: Float[Array, ""]
@@ -194,6 +195,7 @@ class Task(eqx.Module):
             has_heading=jnp.asarray(0.0 if goal.heading is None else 1.0),
             low=jnp.asarray(low),
             high=jnp.asarray(high),
+            t1=jnp.asarray(t1),
             clearance=jnp.asarray(clearance),
             length=body.wheelbase,
             speed=jnp.asarray(speed),
@@ -444,7 +446,7 @@ def _minimise(
     return best[0], equations.residuals, damping
 
 
-def optimise(candidates: Candidates, task: Task, firmness: float = 1.0) -> tuple[Candidates, np.ndarray, np.ndarray]:
+def optimise(candidates: Candidates, task: Task, firmness: float) -> tuple[Candidates, np.ndarray, np.ndarray]:
     """Minimise the effort or the duration of all candidates under the constraints, until the effort of one of them, or the
     duration of all, is feasible and settled, or the penalties, times the firmness, are used up.
 
