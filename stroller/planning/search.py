@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from nonholonomic.geometry import Plane
 
-from .problem import MAPPED, SEARCH_CURVATURES, Numbers, Obstacles, Problem, poses_at
+from .problem import MAPPED, SEARCH_CURVATURES, Numbers, Obstacles, Problem, outline_of, poses_at
 from .transcription import ORDER
 
 # The region of a search, and what the stroller may do there.
@@ -102,8 +102,7 @@ class Search:
         self.problem, self.costs, self.has_heading = problem, costs, problem.goal.heading is not None
         start, self.goal = problem.point(problem.start_pose), problem.point(problem.goal_pose)
         # NumPy would otherwise dispatch every operation with these to JAX.
-        obstacles, footprint = Obstacles.of(problem.standing, 1), jax.tree.map(np.asarray, problem.footprint)
-        self.obstacles, self.footprint = obstacles, footprint
+        self.obstacles, self.footprint = Obstacles.of(problem.standing, 1), jax.tree.map(np.asarray, problem.footprint)
         low, high, space = problem.turns
         self.least, self.greatest = max(low, share * low), min(high, share * high)
         self.sharpest = max(-self.least, self.greatest)
@@ -111,15 +110,14 @@ class Search:
         self.directions = tuple(sign for sign, speed in ((1.0, fastest), (-1.0, -slowest)) if speed > 0.0)
         # The whole map, or a region around the start, the goal and all obstacles, with space to turn.
         if problem.map is None:
-            boxes, centres, radii = obstacles.boxes.reshape(-1, 2), obstacles.centres, obstacles.radii[:, None]
-            points = np.concatenate([boxes, centres - radii, centres + radii])
-            points = np.concatenate([[start[:2], self.goal[:2]], points])
+            outlines = (outline_of(part) for part, _ in problem.standing)
+            points = np.concatenate([[start[:2], self.goal[:2]], *outlines])
             self.low, high = points.min(axis=0) - space, points.max(axis=0) + space
             self.size = high - self.low
         else:
             self.low = np.full(2, -MAPPED * problem.map[0])
             self.size = -2.0 * self.low
-        self.cell = max(0.2 * float(footprint.length), float(self.size.max()) / MOST_CELLS)
+        self.cell = max(0.2 * float(self.footprint.length), float(self.size.max()) / MOST_CELLS)
         nx, ny = np.ceil(self.size / self.cell).astype(int) + 1
         self.shape = (int(nx), int(ny))
         # A curve that turns by less than a heading of the grid would end in the cell of a cheaper one, and the search would
