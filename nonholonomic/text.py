@@ -163,6 +163,11 @@ def readable_unit(unit: str) -> str:
     return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
 
 
+def with_unit(name: str, unit: str) -> str:
+    """The name of a number with its unit, if it has one: `time [s]`."""
+    return f"{name} [{readable_unit(unit)}]" if readable_unit(unit) else name
+
+
 def in_unit(si: str, unit: Unit) -> tuple[str, float]:
     """The unit in which to show a number in the SI unit `si`, and the factor that converts the number.
 
@@ -212,7 +217,7 @@ def require_unit_of(unit: Unit, units: Mapping[str, str]) -> None:
     """
     possible = {name for si in units.values() for name in UNITS.get(readable_unit(si), {})}
     if unit and possible.isdisjoint(_with_rates(unit)):
-        listed = ", ".join(f"{name} [{readable_unit(si)}]" if readable_unit(si) else name for name, si in units.items())
+        listed = ", ".join(with_unit(name, si) for name, si in units.items())
         raise ValueError(f"unit = {shown(unit)} fits nothing that is drawn: {listed}")
 
 

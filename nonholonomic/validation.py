@@ -127,58 +127,9 @@ def _first(numbers: np.ndarray, holds: np.ndarray | np.bool_) -> str:
     return shown(numbers[~holds].ravel()[0]) if numbers.ndim else shown(numbers)
 
 
-def require(
-    value: object,
-    name: str,
-    *,
-    above: Limit = None,
-    at_least: Limit = None,
-    below: Limit = None,
-    at_most: Limit = None,
-    why: str = "",
-    unit: str = "",
-) -> None:
-    """Raise `ValueError` unless every number in `value` is finite and within the bounds.
-
-    **Arguments:**
-
-    - `value`: a number or an array of numbers; a traced value or traced bounds pass unchecked.
-    - `name`: name in the message.
-    - `above`, `at_least`, `below`, `at_most`: bounds, each a number.
-    - `why`: a remark to append to the message.
-    - `unit`: "rad" for an angle, so that the message asks whether a number above its bounds is in degrees.
-
-    **Raises:** `ValueError` that names the argument, its value and what is allowed.
-    """
-    if is_traced(value):
-        return
-    # NumPy would convert these to numbers.
-    if value is None or isinstance(value, str | bytes):
-        hint = ""
-        with contextlib.suppress(ValueError):
-            hint = f": did you mean {float(str(value).replace(',', '.')):g}?"
-        raise ValueError(f"{name} = {shown(value)} is not a number{hint}")
-    # JAX transformations rebuild pytrees with placeholders, but constructors must not receive any.
-    try:
-        numbers = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} = {shown(value)} is not a number") from None
-    except OverflowError:
-        raise ValueError(f"{name} is an integer beyond 1.8e308 and must be finite") from None
-    remark = f" ({why})" if why else ""
-    finite = np.isfinite(numbers)
-    if not np.all(finite):
-        raise ValueError(f"{name} = {_first(numbers, finite)} must be finite{remark}")
-    for bound, (holds, words) in zip((above, at_least, below, at_most), COMPARISONS, strict=True):
-        if bound is None or is_traced(bound):
-            continue
-        numbers, limits = np.broadcast_arrays(numbers, np.asarray(bound, dtype=float))
-        allowed = holds(numbers, limits)
-        if not np.all(allowed):
-            number = _first(numbers, allowed)
-            degrees = IN_DEGREES.format(number) if unit == "rad" and bound is at_most else ""
-            limit = _first(limits, allowed).replace(str(np.pi), "pi rad")
-            raise ValueError(f"{name} = {number} must be {words} {limit}{remark}{degrees}")
+def require(value: object, name: str, **limits: Any) -> None:
+    """Raise `ValueError` unless every number in `value` is finite and within its limits; arguments as for `Bound`."""
+    Bound(value, name, **limits).require()
 
 
 def require_scalars(values: Mapping[str, Any], otherwise: str) -> None:
@@ -387,7 +338,14 @@ class Usual(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """A number, its name, and the range in which it is legal; arguments as for `require`."""
+    """The range in which a number is legal.
+
+    - `value`: a number or an array of numbers; a traced value or traced limits pass unchecked.
+    - `name`: name in the message.
+    - `above`, `at_least`, `below`, `at_most`: limits, each a number.
+    - `why`: a remark to append to the message.
+    - `unit`: "rad" for an angle, so that the message asks whether a number above its limits is in degrees.
+    """
 
     # Ranges of a number as the metadata of its field.
     POSITIVE = {"range": {"above": 0.0}}  # noqa: RUF012
@@ -404,17 +362,50 @@ class Bound(NamedTuple):
     why: str = ""
     unit: str = ""
 
+    @property
+    def limits(self) -> list[tuple[Limit, Callable[..., Any], str]]:
+        """The limits that there are, how a number is compared with each, and in words."""
+        comparisons = zip((self.above, self.at_least, self.below, self.at_most), COMPARISONS, strict=True)
+        return [(limit, *comparison) for limit, comparison in comparisons if limit is not None]
+
     def require(self) -> None:
-        """Raise `ValueError` unless the number is legal or traced."""
-        require(*self[:2], **dict(zip(self._fields[2:], self[2:], strict=True)))
+        """Raise `ValueError` unless every number is legal or traced."""
+        value, name = self.value, self.name
+        if is_traced(value):
+            return
+        # NumPy would convert these to numbers.
+        if value is None or isinstance(value, str | bytes):
+            hint = ""
+            with contextlib.suppress(ValueError):
+                hint = f": did you mean {float(str(value).replace(',', '.')):g}?"
+            raise ValueError(f"{name} = {shown(value)} is not a number{hint}")
+        # JAX transformations rebuild pytrees with placeholders, but constructors must not receive any.
+        try:
+            numbers = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name} = {shown(value)} is not a number") from None
+        except OverflowError:
+            raise ValueError(f"{name} is an integer beyond 1.8e308 and must be finite") from None
+        remark = f" ({self.why})" if self.why else ""
+        finite = np.isfinite(numbers)
+        if not np.all(finite):
+            raise ValueError(f"{name} = {_first(numbers, finite)} must be finite{remark}")
+        for limit, holds, words in self.limits:
+            if is_traced(limit):
+                continue
+            numbers, limits = np.broadcast_arrays(numbers, np.asarray(limit, dtype=float))
+            allowed = holds(numbers, limits)
+            if not np.all(allowed):
+                number = _first(numbers, allowed)
+                degrees = IN_DEGREES.format(number) if self.unit == "rad" and limit is self.at_most else ""
+                limit_in_words = _first(limits, allowed).replace(str(np.pi), "pi rad")
+                raise ValueError(f"{name} = {number} must be {words} {limit_in_words}{remark}{degrees}")
 
     @property
     def holds(self) -> Bool[Array, "..."]:
         """Whether the number is legal, as an array of the program."""
-        conditions = [jnp.isfinite(self.value)]
-        limits = zip((self.above, self.at_least, self.below, self.at_most), COMPARISONS, strict=True)
-        conditions += [holds(self.value, limit) for limit, (holds, _) in limits if limit is not None]
-        return functools.reduce(jnp.logical_and, conditions)
+        conditions = [holds(self.value, limit) for limit, holds, _ in self.limits]
+        return functools.reduce(jnp.logical_and, conditions, jnp.isfinite(self.value))
 
 
 Function = TypeVar("Function", bound=Callable[..., object])

@@ -368,7 +368,7 @@ def show_of(
         for line, (begin, vector) in lines
     )
     traces = (views.Trace(path, frame.traces[0][0], colour, WIDTH * size),)
-    curves = tuple(map(views.Curve, names, frame.curves))
+    curves = tuple(views.Curve(name, "", values) for name, values in zip(names, frame.curves, strict=True))
     return Show(name, colour, t, frame.normal, size, bodies, traces, arrows, curves)
 
 

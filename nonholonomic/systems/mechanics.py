@@ -439,8 +439,7 @@ class AbstractFormulation(AbstractMode):
 
     def force(self, t: Number, q: Coordinates, rate: Coordinates) -> Coordinates:
         """The generalised force of the system and of the input."""
-        force = self.system.force(t, q, rate)
-        return force if self.input is None else force + self.input_force(t, q, rate)
+        return self.system.force(t, q, rate) + self.input_force(t, q, rate)
 
     def acceleration(self, t: Number, q: Coordinates, rate: Coordinates) -> Coordinates:
         """Second derivative of the coordinates, by the chain rule through this formulation's state."""

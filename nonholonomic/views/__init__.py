@@ -3,7 +3,6 @@ them."""
 
 from .pages import Outputs as Outputs
 from .pages import Page as Page
-from .pages import Viewable as Viewable
 from .pages import can_draw as can_draw
 from .pages import page as page
 from .pages import page_of_job as page_of_job

@@ -3,7 +3,7 @@
 (async () => {
   const { facts, answer, motion, allowed } = window.live, { sliders, words } = facts, { layout } = motion;
   const [asks, moves] = [integrator(answer), integrator(motion)];
-  // The labels of the curves, and the factors that convert their values to the units in these.
+  // The names and units of the curves, and the factors that convert their values to these units.
   const [{ shows: [{ curves }] }] = JSON.parse(document.getElementById("facts").textContent).stages;
   const box = document.getElementById("explore"), result = document.getElementById("result");
   const element = (kind, parent, properties = {}) => parent.appendChild(Object.assign(document.createElement(kind), properties));
@@ -66,7 +66,7 @@
     element("span", result, { className: "word", textContent: Number.isFinite(found) ? word : "\u00a0" });
     const list = element("dl", result), entry = (kind, ...texts) => element(kind, list).append(...texts);
     for (const curve of facts.summaries) {
-      const { label, factor } = curves[curve], [, name, unit = ""] = /^(.*?)(?: \[(.*)\])?$/.exec(label);
+      const { name, unit, factor } = curves[curve];
       const all = run.curves[curve].values.map((value) => factor * value), [begin, end] = [all[0], all[all.length - 1]];
       const drift = Math.max(...all.map((one) => Math.abs(one - begin))) / Math.abs(begin);
       entry("dt", name);

@@ -419,7 +419,7 @@ class Viewable:
         require_unit(unit)
         runs, unit = [cast(Any, self), *require_others(self, others)], unit or unit_of(self)
         runs = runs if draw is None else [run.drawn_by(draw) for run in runs]
-        return curves_in(runs[0].stages(runs[1:], overlaid, unit, *([] if label is None else [label])), unit)
+        return curves_in(runs[0].stages(runs[1:], overlaid, unit, label), unit)
 
 
 def require_others(run: object, others: Any) -> Sequence[Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..parameters import meant, short_names
-from ..text import UNITS, Unit, in_unit, likely, readable_unit, shown
+from ..text import UNITS, Unit, in_unit, likely, readable_unit, shown, with_unit
 from ..validation import require
 from .stage import Marks
 
@@ -456,7 +456,7 @@ class _Drawn(NamedTuple):
             # A number in parentheses after a blank only tells equal launches apart.
             if not has_name or quantity.endswith(" "):
                 quantity = "time" if shown in UNITS["s"] else "measured"
-            names.append(_with_unit(quantity, shown))
+            names.append(with_unit(quantity, shown))
         value, upper, errors, predicted = (
             np.array([getattr(row, name) for row in rows]) for name in ("value", "upper", "error", "prediction")
         )
@@ -511,10 +511,6 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figur
         figure.colorbar(image, ax=axes, shrink=0.8)
     draw_title(figure, str(fit.verdict))
     return figure
-
-
-def _with_unit(name: str, unit: str) -> str:
-    return f"{name} [{readable_unit(unit)}]" if readable_unit(unit) else name
 
 
 def _draw_block(
@@ -624,6 +620,6 @@ def _draw_distribution(fit: "Identification", name: str, axes: "Axes", unit: Uni
     axes.locator_params(axis="x", nbins=4)
     axes.set_ylim(0.0)
     axes.set_yticks([])
-    axes.set_xlabel(_with_unit(short_names(list(fit.estimates))[name], shown))
+    axes.set_xlabel(with_unit(short_names(list(fit.estimates))[name], shown))
     axes.set_ylabel("probability")
     axes.set_title(f"{estimate} {readable_unit(shown)}".rstrip() + f"\n95 %: {low} to {high}", fontsize=9)

@@ -81,14 +81,20 @@ class Arrow(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A number over time, with a label that names its unit.
+    """A number over time, and its unit, which is empty for a number without one.
 
-    `factor` converts the values, in SI units, to the unit of the label.
+    `factor` converts the values, in SI units, to `unit`.
     """
 
-    label: str
+    name: str
+    unit: str
     values: Float[np.ndarray, " times"]
     factor: float = 1.0
+
+    @property
+    def label(self) -> str:
+        """The name with the unit."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
 class Show(NamedTuple):
@@ -137,25 +143,20 @@ class Stage(NamedTuple):
 
 
 def curves_in(stages: list[Stage], unit: Unit) -> list[Stage]:
-    """The stages with their curves, if their labels end in a unit that can be converted, and the sizes of their arrows in
-    other units, as for `in_unit`.
+    """The stages with their curves, and the sizes of their arrows, in other units, as for `in_unit`.
 
     **Raises:** `ValueError` if no curve can be drawn in the unit.
     """
     if unit is None:
         return stages
-    labels = dict.fromkeys(curve.label for stage in stages for show in stage.shows for curve in show.curves)
-    parts = [label.removesuffix("]").partition(" [") for label in labels]
-    require_unit_of(unit, {name: si or "1" for name, _, si in parts})
-
-    def drawn(curve: Curve) -> Curve:
-        name, bracket, si = curve.label.removesuffix("]").rpartition(" [")
-        text, factor = in_unit(si, unit)
-        return curve._replace(label=f"{name} [{text}]", factor=factor) if bracket else curve
+    curves = [curve for stage in stages for show in stage.shows for curve in show.curves]
+    require_unit_of(unit, {curve.name: curve.unit or "1" for curve in curves})
 
     def shown_in(show: Show) -> Show:
-        arrows = (arrow._replace(**converted(arrow.unit, unit)) for arrow in show.arrows)
-        return show._replace(curves=tuple(map(drawn, show.curves)), arrows=tuple(arrows))
+        curves, arrows = (
+            tuple(part._replace(**converted(part.unit, unit)) for part in parts) for parts in (show.curves, show.arrows)
+        )
+        return show._replace(curves=curves, arrows=arrows)
 
     return [stage._replace(shows=tuple(map(shown_in, stage.shows))) for stage in stages]
 

@@ -26,6 +26,8 @@ window.views = window.views || {};
   //: Room left of a curve for its numbers, and below it; the sizes of the texts in pixels.
   const LEFT = 66, FOOT = 5, TEXT = 13;
 
+  const labelOf = ({ name, unit }) => (unit ? `${name} [${unit}]` : name);
+
   class Strips {
     // `runs()`: returns the runs, with `times`, `colour` and `curves`; `seek(time)`: called when the reader clicks at a time.
     constructor(parent, runs, seek) {
@@ -34,7 +36,7 @@ window.views = window.views || {};
         const legend = views.element("div", parent, { className: "names" });
         for (const run of runs()) views.element("span", legend, { textContent: run.legend ?? run.name }).style.color = run.colour;
       }
-      const curves = runs().flatMap((run) => run.curves), labels = [...new Set(curves.map((curve) => curve.label))];
+      const curves = runs().flatMap((run) => run.curves), labels = [...new Set(curves.map(labelOf))];
       // The curves that check a run are folded away below the others.
       const folded = (label) => labels.length > 2 && /^(energy|Jellett)/.test(label);
       let fold = null;
@@ -68,7 +70,7 @@ window.views = window.views || {};
       const runs = this.runs();
       this.duration = Math.max(...runs.map((run) => run.times[run.times.length - 1]));
       for (const strip of this.strips) {
-        strip.curves = runs.flatMap((run) => run.curves.filter((curve) => curve.label === strip.label)
+        strip.curves = runs.flatMap((run) => run.curves.filter((curve) => labelOf(curve) === strip.label)
           .map((curve) => ({
             times: run.times, colour: run.colour, marks: run.marks, values: curve.factor === 1 ? curve.values : curve.values.map((v) => curve.factor * v),
           })));

@@ -58,8 +58,8 @@ FORCES += (("side force, rear", GOLD, 2.0), ("side force, front", GOLD, 2.0))
 SHOWN = ("position", "direction", "steering", "speed", "front_speed", "energy", "normal_force", "load", "side_force")
 
 #: The curves that a page computes.
-CURVES = {"speed": "speed [m/s]", "steering": "steering angle [rad]", "energy": "energy [J]"}
-CURVES |= {"normal_force": "normal force [N]"}
+CURVES = {"speed": ("speed", "m/s"), "steering": ("steering angle", "rad"), "energy": ("energy", "J")}
+CURVES |= {"normal_force": ("normal force", "N")}
 
 
 @views.stage_of.register(Trajectory)
@@ -161,8 +161,8 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
             for (label, colour, limit), (start, vector) in zip(FORCES, frame.arrows, strict=True)
         ),
         (
-            *map(views.Curve, CURVES.values(), frame.curves),
-            views.Curve("friction that the tyres need [1]", needed),
+            *(views.Curve(*curve, values) for curve, values in zip(CURVES.values(), frame.curves, strict=True)),
+            views.Curve("friction that the tyres need", "1", needed),
         ),
         warning if np.max(grip) > MOST_GRIP else "",
     )

@@ -167,7 +167,7 @@ def test_a_plan_shows_what_it_achieves(parked, tmp_path):
     assert title.get_text().count("overlaps") == 5
     assert 0.0 < box.x0 < box.x1 < title.figure.bbox.x1
     page = plan.view(tmp_path / "plan.html", unit="deg")
-    assert "steering angle [deg]" in page.html
+    assert 'steering angle", "unit": "deg"' in page.html
     assert (tmp_path / "plan.html").read_text() == page.html
     # The frame and the wheels, the footprint, the candidates, the obstacles and the goal.
     assert [len(show.bodies) for show in planned_stage(plan).shows] == [4 + 4]

@@ -416,12 +416,12 @@ def test_labels_are_text(browser, page):
     """A quantity may be called what HTML would read as a mark."""
     reset(browser)
     texts = browser.execute_script(
-        "const { answer, summaries } = live.facts, curve = live.curves[summaries[0]], kept = [answer.label, curve.label];"
-        "answer.label = 'time <b>t</b>'; curve.label = '<i>q</i> [J]';"
+        "const { answer, summaries } = live.facts, curve = live.curves[summaries[0]], kept = [answer.label, curve.name];"
+        "answer.label = 'time <b>t</b>'; curve.name = '<i>q</i>';"
         "live.simulate(300); live.map.update(live.values(), true);"
         "const texts = ['result', 'legend'].map((id) => document.getElementById(id));"
         "const marks = texts.map((one) => one.querySelectorAll('b').length), words = texts.map((one) => one.textContent);"
-        "[answer.label, curve.label] = kept; live.simulate(300); return [marks, words]"
+        "[answer.label, curve.name] = kept; live.simulate(300); return [marks, words]"
     )
     assert texts[0] == [0, 0]
     assert "time <b>t</b>" in texts[1][0]

@@ -219,8 +219,8 @@ def test_a_launch_in_degrees_is_shown_in_degrees(run):
     assert in_degrees.plot("energy").axes[0].get_ylabel() == "energy [J]"
     assert in_degrees.portrait().axes[0].get_xlabel() == "inclination θ [deg]"
     assert "theta [deg]: " in repr(in_degrees.to_table())
-    assert "normal to axis [deg]" in in_degrees.view().html
-    assert "normal to axis [deg]" in in_degrees.explore().html
+    assert 'normal to axis", "unit": "deg"' in in_degrees.view().html
+    assert 'normal to axis", "unit": "deg"' in in_degrees.explore().html
     several = tippe.InversionTimes([launch, tippe.Launch(0.1, 155.0)], [5.0, 6.0], 0.1, t1=20.0).launch
     assert_close(several.theta, [np.radians(6.0), 0.1], rtol=1e-15)
     assert "spin=[1500, 1480.14] rpm" in repr(several)
@@ -232,7 +232,7 @@ def test_a_launch_in_degrees_is_shown_in_degrees(run):
     assert "velocity=(0.1, 0.2, 0.3) rad/s" in repr(tippe.Launch.degrees(6, 1500, angular_velocity=(0.1, 0.2, 0.3)))
     again = nonholonomic.simulate(run.scene, launch, 1.0, tolerance=1e-6)
     assert again.plot("theta").axes[0].get_ylabel() == "inclination θ [deg]"
-    assert "normal to axis [deg]" in nonholonomic.explore(run.scene, launch, t1=1.0).html
+    assert 'normal to axis", "unit": "deg"' in nonholonomic.explore(run.scene, launch, t1=1.0).html
 
 
 def test_labels_are_what_differs(run):

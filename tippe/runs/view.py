@@ -23,8 +23,9 @@ from nonholonomic.runs.table import at_the_end
 from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, page_of, runs_at_ends, sliders_of
 from nonholonomic.sweeps import chunk_for
 from nonholonomic.terminal import status_line
-from nonholonomic.text import Unit
+from nonholonomic.text import Unit, readable_unit
 from nonholonomic.views.explore import Frame, LiveRun
+from nonholonomic.views.plot import new_figure
 
 from ..friction import NoSlip
 from ..model.body import AbstractBody, Top
@@ -124,7 +125,8 @@ def show(scene: Scene, times: np.ndarray, frames: Frame[np.ndarray], number: int
         scale = length * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
         arrows.append(views.Arrow(arrow, start, vector, unit, scale, shade, width, None, True, False))
     rotation = OF_RIGID_BODIES["normal_spin"] if isinstance(body, AbstractRigidBody) else QUANTITIES["jellett"]
-    labels = [QUANTITIES["energy"].label, rotation.label, QUANTITIES["normal_force"].label]
+    quantities = (QUANTITIES["energy"], rotation, QUANTITIES["normal_force"])
+    curves = [("θ, normal to axis", "rad"), *((part.long_name, readable_unit(part.unit)) for part in quantities)]
     return views.Show(
         name,
         colour,
@@ -137,7 +139,7 @@ def show(scene: Scene, times: np.ndarray, frames: Frame[np.ndarray], number: int
             views.Trace("path of the axis", axis[0], BLUE, 0.012 * radius, axis[1], False),
         ),
         tuple(arrows),
-        tuple(map(views.Curve, ["θ, normal to axis [rad]", *labels], frames.curves)),
+        tuple(views.Curve(*curve, values) for curve, values in zip(curves, frames.curves, strict=True)),
     )
 
 
@@ -382,9 +384,8 @@ def draw_launches(panels: list[Panel], angle: float, dots: str, unit: str = "rad
     **Returns:** a matplotlib figure.
     """
     from matplotlib import colormaps
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13.0 if len(panels) > 1 else 8.0, 4.2), layout="constrained")
+    figure = new_figure(13.0 if len(panels) > 1 else 8.0, 4.2)
     drawings = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for drawing, panel in zip(drawings, panels, strict=True):
         colours = colormaps["viridis"](np.linspace(0.0, 0.92, len(panel.starts)))

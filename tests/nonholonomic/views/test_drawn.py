@@ -74,7 +74,7 @@ def rolling(surface=None) -> Stage:
         (body,),
         (Trace("path", foot, 0x1F8A4C, 0.01),),
         (Arrow("up", foot, np.tile([0.0, 0.0, 2.0], (41, 1)), "N", radius, 0x7B4FA3, 0.01, 1.5 * radius),),
-        (Curve("x [m]", position[:, 0]), Curve("z [m]", position[:, 2])),
+        (Curve("x", "m", position[:, 0]), Curve("z", "m", position[:, 2])),
     )
     ground = arena(Plane(), foot, np.array([0.0, 0.0, 1.0]), 0.2, 0.1)
     return Stage("rolling", ground, (show,))
@@ -83,7 +83,7 @@ def rolling(surface=None) -> Stage:
 class Rolling(Viewable):
     """A run with the stage of `rolling`."""
 
-    def stages(self, others=(), overlaid=False, unit=None):
+    def stages(self, others=(), overlaid=False, unit=None, label=None):
         return [rolling()]
 
 
@@ -219,7 +219,7 @@ def test_a_view_has_the_unit_that_was_asked_for(tmp_path, monkeypatch):
     run = Rolling()
     monkeypatch.setattr("nonholonomic.views.pages.BROWSERS", (sys.executable,))
     assert re.search(
-        r'"label": "z \[cm\]", "values": \{"floats": \[\d+, \d+\]\}, "factor": 100\.0', run.view(unit="cm").html
+        r'"name": "z", "unit": "cm", "values": \{"floats": \[\d+, \d+\]\}, "factor": 100\.0', run.view(unit="cm").html
     )
     with pytest.raises(ValueError, match=r"unit = 'deg' fits nothing that is drawn: x \[m\], z \[m\]"):
         run.view(unit="deg")
