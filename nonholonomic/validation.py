@@ -127,7 +127,7 @@ def _first(numbers: np.ndarray, holds: np.ndarray | np.bool_) -> str:
     return shown(numbers[~holds].ravel()[0]) if numbers.ndim else shown(numbers)
 
 
-def require(value: object, name: str, **limits: Any) -> None:
+def require(value: object, name: str, **limits: Limit) -> None:
     """Raise `ValueError` unless every number in `value` is finite and within its limits; arguments as for `Bound`."""
     Bound(value, name, **limits).require()
 

@@ -426,53 +426,60 @@ MOST_LABELS = 12
 MARGIN = 0.08
 
 
-class _Drawn(NamedTuple):
-    """What is drawn of every measurement, in the units of the picture.
+class _Series(NamedTuple):
+    """The measurements of one series, in the units of the picture.
 
-    - `series`: the indices of the measurements of each series; `names`: the quantity of each series with its unit, such as
-      "1: theta [deg]", where the number is that of the data.
-    - `value`, `upper`, `errors`, `predicted`: (n,); `is_limit`: (n,); `times`, `curves`: (slices, n), as `fit.curves`.
+    - `name`: their quantity with its unit, such as "1: theta [deg]", where the number is that of the data.
+    - `has_time`: whether they are samples; `places`: their times [s], or else their numbers in the picture; `labels`.
+    - `curve`: times and predictions, also between the samples, or `None`.
+    - `value`, `upper`, `errors`, `predicted`, `residuals`, `is_limit`: (n,).
     """
 
-    series: list[np.ndarray]
-    names: list[str]
+    name: str
+    colour: str
+    has_time: bool
+    places: np.ndarray
+    labels: list[str]
+    curve: tuple[np.ndarray, ...] | None
     value: np.ndarray
     upper: np.ndarray
     errors: np.ndarray
     predicted: np.ndarray
+    residuals: np.ndarray
     is_limit: np.ndarray
-    times: np.ndarray
-    curves: np.ndarray
 
-    @classmethod
-    def of(cls, fit: "Identification", unit: Unit) -> "_Drawn":
-        numbers = np.asarray(fit.density.measurements.series)
-        series, names = [np.flatnonzero(numbers == number) for number in np.unique(numbers)], []
-        rows, shown_units, factors = zip(*fit.rows_in(unit), strict=True)
-        factors = np.array(factors)
-        for indices in series:
-            label, shown = rows[indices[0]].label, shown_units[indices[0]]
-            quantity, has_name, _ = label.partition("(")
-            # A number in parentheses after a blank only tells equal launches apart.
-            if not has_name or quantity.endswith(" "):
-                quantity = "time" if shown in UNITS["s"] else "measured"
-            names.append(with_unit(quantity, shown))
-        value, upper, errors, predicted = (
-            np.array([getattr(row, name) for row in rows]) for name in ("value", "upper", "error", "prediction")
-        )
-        is_limit = np.array([row.censored for row in fit.residuals])
-        # Draw an angle on the same turn as its prediction.
-        turns = factors * np.asarray(fit.density.measurements.whole_periods((predicted - value) / factors))
-        value, (times, curves) = np.where(is_limit, value, value + turns), fit.curves
-        curves = factors * curves if len(curves) else curves
-        return cls(series, names, value, upper, errors, predicted, is_limit, times, curves)
 
-    def panels(self, chosen: list[int]) -> dict[str, list[int]]:
-        """The series among `chosen` that share a panel, by the quantity, whatever the number of the data."""
-        panels: dict[str, list[int]] = {}
-        for k in chosen:
-            panels.setdefault(self.names[k].rpartition(": ")[2], []).append(k)
-        return panels
+def _series_of(fit: "Identification", labels: Sequence[str], unit: Unit) -> list[_Series]:
+    """The measurements of a fit. **Arguments:** as for `draw_fit`."""
+    measurements, (times_of_curves, curves) = fit.density.measurements, fit.curves
+    numbers, times = np.asarray(measurements.series), np.asarray(measurements.time)
+    rows, units, factors = zip(*fit.rows_in(unit), strict=True)
+    factors = np.array(factors)
+    value, upper, errors, predicted, residuals, is_limit = (
+        np.array([getattr(row, name) for row in rows])
+        for name in ("value", "upper", "error", "prediction", "residual", "censored")
+    )
+    # Draw an angle on the same turn as its prediction.
+    turns = factors * np.asarray(measurements.whole_periods((predicted - value) / factors))
+    value, all_series, without_time = np.where(is_limit, value, value + turns), [], 0
+    for number in np.unique(numbers):
+        indices = np.flatnonzero(numbers == number)
+        quantity, has_name, _ = rows[indices[0]].label.partition("(")
+        # A number in parentheses after a blank only tells equal launches apart.
+        if not has_name or quantity.endswith(" "):
+            quantity = "time" if units[indices[0]] in UNITS["s"] else "measured"
+        places, curve = times[indices], None
+        has_time = bool(np.any(places))
+        if not has_time:
+            places = without_time + np.arange(len(indices))
+            without_time += len(indices)
+        elif len(curves):
+            curve = tuple(part[:, indices].T.ravel() for part in (times_of_curves, factors * curves))
+        arrays = (part[indices] for part in (value, upper, errors, predicted, residuals, is_limit))
+        name, colour = with_unit(quantity, units[indices[0]]), f"C{len(all_series)}"
+        texts = [labels[i] for i in indices.tolist()]
+        all_series.append(_Series(name, colour, has_time, places, texts, curve, *arrays))
+    return all_series
 
 
 def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figure":
@@ -484,21 +491,21 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figur
 
     **Returns:** a matplotlib figure.
     """
-    names, drawn, times = list(fit.estimates), _Drawn.of(fit, unit), np.asarray(fit.density.measurements.time)
+    names, panels_of_blocks = list(fit.estimates), {}
+    for series in _series_of(fit, labels, unit):
+        # Series of one quantity share a panel, whatever the number of the data.
+        panels = panels_of_blocks.setdefault(series.has_time, {})
+        panels.setdefault(series.name.rpartition(": ")[2], []).append(series)
     determined = [name for name in names if np.isfinite(fit.standard_errors[name])][:MOST_DISTRIBUTIONS]
     # The correlations of one number say nothing.
     correlated = len(names) > 1
     lower = len(determined) + correlated or 1
-    has_time = [bool(np.any(times[indices])) for indices in drawn.series]
-    blocks = [
-        [k for k, timed in enumerate(has_time) if timed == wanted] for wanted in (True, False) if wanted in has_time
-    ]
-    most = max(len(drawn.panels(block)) for block in blocks)
-    figure = new_figure(max(9.0, 2.9 * lower, 6.5 * len(blocks)), 6.5 + 2.0 * most)
+    most = max(map(len, panels_of_blocks.values()))
+    figure = new_figure(max(9.0, 2.9 * lower, 6.5 * len(panels_of_blocks)), 6.5 + 2.0 * most)
     rows = figure.add_gridspec(2, 1, height_ratios=(1.0 + 2.0 * most, 1.6))
-    columns = rows[0].subgridspec(1, len(blocks))
-    for column, block in enumerate(blocks):
-        _draw_block(fit, drawn, block, has_time[block[0]], labels, figure, columns[column])
+    columns = rows[0].subgridspec(1, len(panels_of_blocks))
+    for column, has_time in enumerate(sorted(panels_of_blocks, reverse=True)):
+        _draw_block(panels_of_blocks[has_time], figure, columns[column])
     grid = rows[1].subgridspec(1, lower)
     for k, name in enumerate(determined):
         _draw_distribution(fit, name, figure.add_subplot(grid[k]), unit)
@@ -513,67 +520,57 @@ def draw_fit(fit: "Identification", labels: Sequence[str], unit: Unit) -> "Figur
     return figure
 
 
-def _draw_block(
-    fit: "Identification",
-    drawn: _Drawn,
-    block: list[int],
-    has_time: bool,
-    labels: Sequence[str],
-    figure: "Figure",
-    place: "SubplotSpec",
-) -> None:
-    """Draw series over their times, or over the numbers of their measurements: the data and the residuals."""
-    indices = np.concatenate([drawn.series[k] for k in block])
-    abscissa = np.full(len(drawn.value), np.nan)
-    abscissa[indices] = np.asarray(fit.density.measurements.time)[indices] if has_time else np.arange(len(indices))
-    panels, first = drawn.panels(block), None
+def _draw_block(panels: dict[str, list[_Series]], figure: "Figure", place: "SubplotSpec") -> None:
+    """Draw series over their times, or over the numbers of their measurements: the data, in panels, and the residuals."""
+    block, first = list(itertools.chain(*panels.values())), None
     grid = place.subgridspec(len(panels) + 1, 1, height_ratios=[2.0] * len(panels) + [1.0])
     for row, (name, series) in enumerate(panels.items()):
         axes = figure.add_subplot(grid[row], sharex=first)
         first = axes if first is None else first
         axes.tick_params(labelbottom=False)
-        _draw_data(drawn, axes, series, abscissa, has_time)
+        _draw_data(axes, series)
         axes.set_ylabel(name)
     residuals = figure.add_subplot(grid[len(panels)], sharex=first)
-    for k in block:
-        residuals.plot(
-            abscissa[drawn.series[k]], [fit.residuals[i].residual for i in drawn.series[k]], ".", color=f"C{k}"
-        )
+    for series in block:
+        residuals.plot(series.places, series.residuals, ".", color=series.colour)
     residuals.axhspan(-1.96, 1.96, color="0.9", zorder=0)
     residuals.set_ylabel("residual\n[standard errors]")
-    if has_time:
+    labels = [label for series in block for label in series.labels]
+    if block[0].has_time:
         residuals.set_xlabel("time since the first sample [s]")
-    elif len(indices) <= MOST_LABELS:
-        residuals.set_xticks(abscissa[indices], [str(labels[i]) for i in indices], rotation=20, ha="right", fontsize=8)
+    elif len(labels) <= MOST_LABELS:
+        places = np.concatenate([series.places for series in block])
+        residuals.set_xticks(places, labels, rotation=20, ha="right", fontsize=8)
     else:
         residuals.set_xlabel("measurement")
 
 
-def _draw_data(drawn: _Drawn, axes: "Axes", series: list[int], abscissa: np.ndarray, has_time: bool) -> None:
+def _draw_data(axes: "Axes", panel: list[_Series]) -> None:
     """Draw the series of one panel with their predictions, as curves if they have times."""
-    several = len(series) > 1
-    for k in series:
-        colour, indices = f"C{k}", drawn.series[k]
-        exact = indices[~drawn.is_limit[indices]]
-        text = drawn.names[k] if several else "measured"
-        axes.errorbar(abscissa[exact], drawn.value[exact], drawn.errors[exact], fmt=".", color=colour, label=text)
-        if has_time and len(drawn.curves):
-            moments, curve = (part[:, indices].T.reshape(-1) for part in (drawn.times, drawn.curves))
-            axes.plot(moments, curve, color=colour, alpha=0.5, linewidth=1.2, label=None if several else "predicted")
+    several = len(panel) > 1
+    for series in panel:
+        exact = ~series.is_limit
+        places, text = series.places[exact], series.name if several else "measured"
+        axes.errorbar(places, series.value[exact], series.errors[exact], fmt=".", color=series.colour, label=text)
+        if series.curve is not None:
+            text = None if several else "predicted"
+            axes.plot(*series.curve, color=series.colour, alpha=0.5, linewidth=1.2, label=text)
         else:
-            allowed = exact[np.isfinite(drawn.predicted[exact])]
-            text = "predicted" if k == series[0] else None
-            axes.plot(abscissa[allowed], drawn.predicted[allowed], "x", color="0.3", label=text)
-    indices = np.concatenate([drawn.series[k] for k in series])
-    exact, limits = indices[~drawn.is_limit[indices]], indices[drawn.is_limit[indices]]
-    if len(exact):
+            text = "predicted" if series is panel[0] else None
+            axes.plot(places, series.predicted[exact], "x", color="0.3", label=text)
+    places, value, upper, errors, predicted, is_limit = (
+        np.concatenate([getattr(series, name) for series in panel])
+        for name in ("places", "value", "upper", "errors", "predicted", "is_limit")
+    )
+    if not np.all(is_limit):
         # The measured values set the range, and the predictions as far as they are no farther than these.
-        value, error, predicted = drawn.value[exact], drawn.errors[exact], drawn.predicted[exact]
-        low, high = float(np.min(value - error)), float(np.max(value + error))
-        near = np.clip(predicted[np.isfinite(predicted)], low - 0.5 * (high - low), high + 0.5 * (high - low))
+        exact = ~is_limit
+        low, high = float(np.min((value - errors)[exact])), float(np.max((value + errors)[exact]))
+        near = predicted[exact & np.isfinite(predicted)]
+        near = np.clip(near, low - 0.5 * (high - low), high + 0.5 * (high - low))
         low, high = min([low, *near]), max([high, *near])
         axes.set_ylim(low - MARGIN * (high - low), high + MARGIN * (high - low))
-    _draw_limits(axes, abscissa[limits], drawn.value[limits], drawn.upper[limits])
+    _draw_limits(axes, places[is_limit], value[is_limit], upper[is_limit])
     axes.legend(fontsize=8)
 
 
