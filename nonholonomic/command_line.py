@@ -8,7 +8,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import NoReturn
 
 #: Longest time [s] that the main thread may take to report what was saved before the process ends without the report.
@@ -25,7 +25,7 @@ def import_quietly() -> None:
 
     A `KeyboardInterrupt` would be lost if it arrived during garbage collection, where JAX calls back into Python.
     """
-    program, excepthook = sys.orig_argv[sys.orig_argv.index("-m") + 1], sys.excepthook
+    program = sys.orig_argv[sys.orig_argv.index("-m") + 1]
 
     def end(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -34,14 +34,6 @@ def import_quietly() -> None:
     # A shell may have told this process to ignore the signal.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, end)
-
-    def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        if issubclass(kind, KeyboardInterrupt):
-            print(f"python -m {program}: interrupted", file=sys.stderr)
-        else:
-            excepthook(kind, error, trace)
-
-    sys.excepthook = hook
 
 
 def run_and_exit(main: Callable[[], int], program: str) -> NoReturn:

@@ -108,14 +108,14 @@ def described(options: argparse.Namespace) -> list[str]:
     top, mm = TOPS[options.top](), lambda length: f"{1e3 * float(length):.3g} mm"
     alpha, gamma = steady.proportions(top)
     stem = "no stem" if top.stem is None else f"a stem {mm(2.0 * top.stem.radius)} thick"
-    launch = Launch.degrees(middle(options.theta), options.rpm)
+    spin = float(launch_shown(options).spin)
     return [
         f"A {options.top} top: {1e3 * float(top.mass):.3g} g, {mm(2.0 * top.radius)} across, {stem}, "
         f"its centre of mass {mm(top.offset)} below the centre.",
         f"I1 / I3 = {float(gamma):.3f} lies {'' if steady.group(top) == 'II' else 'not '}between 1 - a / R = "
         f"{1.0 - float(alpha):.3f} and 1 + a / R = {1.0 + float(alpha):.3f}, so it can "
         f"{'' if steady.group(top) == 'II' else 'not '}turn over.",
-        f"Spun at {options.rpm:g} rpm ({float(launch.spin):.4g} rad/s), inclined by theta(0); Coulomb friction mu.",
+        f"Spun at {options.rpm:g} rpm ({spin:.4g} rad/s), inclined by theta(0); Coulomb friction mu.",
     ]
 
 
@@ -183,8 +183,9 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
                 live = threads.submit(kept_files, cache, page_facts, contents)
             for arena in ARENAS:
                 tables[arena] = futures[arena].result()
+                heading = f"\nTime until it has turned over, {headings(options)[arena]}"
                 with display.aside():
-                    print(report(options, arena, tables[arena]), flush=True)
+                    print(heading, *paper.aligned(rows_of(options, tables[arena])), sep="\n", flush=True)
                 display.advance(1)
                 # Drawn while the threads compile, after the table of the plane, whose programs it uses.
                 if arena == "plane" and views.can_draw():
@@ -221,12 +222,6 @@ def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
 def headings(options: argparse.Namespace) -> dict[str, str]:
     """The headings of the table of each arena."""
     return {"plane": "on a table [s]", "cylinder": f"in a cylinder of {100 * options.cylinder_radius:g} cm radius [s]"}
-
-
-def report(options: argparse.Namespace, arena: str, table: Table) -> str:
-    """The table of an arena as text."""
-    heading = f"Time until it has turned over, {headings(options)[arena]}"
-    return "\n".join(["", heading, *paper.aligned(rows_of(options, table))])
 
 
 def picture(options: argparse.Namespace, times: Times, theta: Times, plane: Table) -> "Figure":
