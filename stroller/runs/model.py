@@ -32,7 +32,6 @@ from nonholonomic.terminal import status_line
 from nonholonomic.text import is_array, is_users, name_of, parted, shown
 from nonholonomic.validation import all_bounds, explaining, legal, require_kind, require_outside, require_scalars
 
-from ..friction import Damping, RollingResistance
 from ..model import input as inputs
 from ..model.dynamics import Stroller
 from ..model.input import Formula, Input, PerRide, Steady
@@ -42,8 +41,7 @@ from .trajectory import QUANTITIES, TIMED, VECTORS, RideState, Trajectory, ride
 #: Names of the coordinates of a place in the fixed frame.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
 
-UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
-UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
+UNITS = Stroller.units | Scene.units | Steady.units | Launch.units
 
 # The launch has a number of the same short name.
 UNITS |= {"scene.friction.steering": "N m s"}
@@ -134,12 +132,13 @@ class RideModel(AbstractSceneModel):
         """The name of an axis is the last part of its full name, or the last two parts if one is ambiguous. Numbers of a
         place have the surface's names, followed by a zero: `x0`."""
         surface, place = self.scene.surface, self.launch.place
+        units = self.scene.friction.units | surface.units | UNITS
         last_names = [name.rsplit(".", 1)[-1] for name in names]
         coordinates = surface.coordinates if len(place) == len(surface.coordinates) else FIXED
         places = dict(zip([f"launch.place[{k}]" for k in range(len(place))], coordinates, strict=True))
         labels = {}
         for full, last in zip(names, last_names, strict=True):
-            name, unit = last, UNITS.get(full, UNITS.get(last, "1"))
+            name, unit = last, units.get(full, units.get(last, "1"))
             if full in places:
                 name, unit = places[full][0] + "0", places[full][1]
             elif last_names.count(last) > 1 or last in TAKEN:
