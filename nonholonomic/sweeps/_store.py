@@ -43,8 +43,8 @@ CHECKSUMS = "checksums"
 #: The array of a byte for each chunk, in the same group: not 0 when the chunk is finished.
 FINISHED = "finished chunks"
 
-#: The attribute of this group with the layout of the table.
-LAYOUT = "layout"
+#: The attributes of this group with the layout of the table, and its checksum: that of HDF5 does not cover a long attribute.
+LAYOUT, OF_LAYOUT = "layout", "checksum of the layout"
 
 #: Variables of tables larger than this [bytes] are read only when needed.
 MAX_BYTES_IN_MEMORY = 1 << 27
@@ -157,7 +157,9 @@ def _describe(stream: Stream, layout: Layout) -> dict[str, int]:
         checksums = file.create_group(CHECKSUMS)
         words = {name: values.tolist() for name, values in layout.coords.items() if values.dtype.kind == "U"}
         names = {"coords": dict.fromkeys(layout.coords) | words, "kinds": list(layout.kinds)}
-        _set(checksums, LAYOUT, json.dumps(layout._asdict() | names))
+        text = json.dumps(layout._asdict() | names)
+        _set(checksums, LAYOUT, text)
+        _set(checksums, OF_LAYOUT, zlib.crc32(text.encode()))
         meanings = layout.words | words
         for name, values in layout.coords.items():
             codes = np.arange(len(values), dtype=np.int8)
@@ -300,7 +302,10 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values], dict[str, i
     arrays, checksums = cast("dict[str, h5py.Dataset]", file), cast("h5py.Group", file[CHECKSUMS])
     if LAYOUT not in checksums.attrs:
         raise ValueError("another program wrote it, or an earlier version, which can resume it")
-    fields, places = json.loads(cast(bytes, checksums.attrs[LAYOUT])), _places(file)
+    text = cast(bytes, checksums.attrs[LAYOUT])
+    if zlib.crc32(text) != checksums.attrs[OF_LAYOUT]:
+        raise ValueError("the description of the table does not match its checksum")
+    fields, places = json.loads(text), _places(file)
     # The marks first: a sweep may finish a chunk meanwhile, which would then have its new mark and its old checksum.
     sums = {name: np.asarray(checksums[name]) for name in sorted(checksums, key=lambda name: name != FINISHED)}
     coords = {}

@@ -219,6 +219,18 @@ def test_a_file_cut_at_a_hundred_lengths(images, tmp_path):
     check_cuts(images, tmp_path, lambda image: random.integers(len(image), size=100))
 
 
+def test_a_changed_layout_is_refused_however_long_it_is(tmp_path):
+    """HDF5 has no checksum for attributes of more than 64 KB."""
+    for size in (1, 100_000):
+        path = tmp_path / f"{size}.h5"
+        request = json.dumps({"data": size * "x"})
+        Table({"x": np.arange(3.0)}, {"value": np.ones(3)}, {"x": "m"}, {"request": request}).save(path)
+        image = bytearray(path.read_bytes())
+        image[image.index(b'"units": {"x": "m"}') + 15] ^= 1
+        path.write_bytes(image)
+        assert contents(path) is None
+
+
 def test_a_file_with_a_hole(images, tmp_path):
     """Zeros where the numbers of finished blocks were, as after a copy that broke off: refused, and repaired by a sweep."""
     path = tmp_path / "whole.h5"
@@ -338,8 +350,12 @@ def test_a_full_disk_leaves_no_half_file(tmp_path):
 def hostile_files():
     """Changes of a file with right checksums, each of which another program could have written."""
 
+    def with_layout(file, text):
+        file["checksums"].attrs["layout"] = np.bytes_(text.encode())
+        file["checksums"].attrs["checksum of the layout"] = zlib.crc32(text.encode())
+
     def of_layout(file, **changes):
-        file["checksums"].attrs["layout"] = json.dumps(json.loads(file["checksums"].attrs["layout"]) | changes)
+        with_layout(file, json.dumps(json.loads(file["checksums"].attrs["layout"]) | changes))
 
     def no_cells_in_a_chunk(file):
         of_layout(file, chunk=0)
@@ -368,7 +384,7 @@ def hostile_files():
         file["checksums"]["x"][0] = zlib.crc32(np.zeros((5, 10)))
 
     def too_deep(file):
-        file["checksums"].attrs["layout"] = "[" * 30_000
+        with_layout(file, "[" * 30_000)
 
     def another_shape(file):
         of_layout(file, inner={"value": ["x"]})
@@ -377,7 +393,7 @@ def hostile_files():
         del file["value"]
         file["value"] = h5py.SoftLink("/value")
 
-    return [value for name, value in locals().items() if callable(value) and value is not of_layout]
+    return [value for name, value in locals().items() if callable(value) and value not in (with_layout, of_layout)]
 
 
 @pytest.mark.parametrize("change", hostile_files(), ids=lambda change: change.__name__)
