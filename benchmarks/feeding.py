@@ -144,7 +144,7 @@ def main() -> None:
         print(f"so one parent feeds {rate * options.each:.0f} workers that take {options.each:g} s a cell")
         # Every worker gets the same number of chunks of the same size, whatever the number of workers.
         size = -(-cells // times.blocks // 512) * 512
-        running.chunks_together, original = lambda layout, chunk: size // chunk, running.chunks_together
+        running.chunks_together, original = lambda layout: size // layout.chunk, running.chunks_together
         cell_count = size * options.workers * 8 >> 12 << 12
         ideal = cell_count * options.each / options.workers
         times = run(cell_count, options.workers, options.each, Path(folder))

@@ -178,10 +178,11 @@ class AbstractTimes(AbstractEventTimes):
     def labels_in(self, unit: str | Sequence[str] | None) -> tuple[str, ...]:
         # In NumPy: JAX would take a millisecond for each launch.
         launch = jax.tree.map(np.asarray, self.launch)
+        count = len(self.time)
         launches = [
-            jax.tree.map(lambda leaf, k=k: leaf if np.ndim(leaf) == 0 else leaf[k], launch) for k in range(self.size)
+            jax.tree.map(lambda leaf, k=k: leaf if np.ndim(leaf) == 0 else leaf[k], launch) for k in range(count)
         ]
-        return tuple(distinguishing_labels([("launch",)] * self.size, launches, unit=unit, longest=None))
+        return tuple(distinguishing_labels([("launch",)] * count, launches, unit=unit, longest=None))
 
 
 class InversionTimes(AbstractTimes):

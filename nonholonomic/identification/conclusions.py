@@ -3,7 +3,6 @@
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -97,16 +96,15 @@ def judge(
 
     measurements, by_slopes = ends.density.measurements, ends.covariance(ends.best)
     prediction, residual = ends.linearised.prediction[ends.best], ends.linearised.residual[ends.best]
-    exact = ~np.asarray(measurements.censored)
+    exact = ~measurements.censored
     missing = int(np.sum(~np.isfinite(prediction[exact])))
     violated = int(np.sum(np.abs(residual[: len(exact)][~exact]) > FAR))
     degrees = len(residual) - len(by_slopes) - int(np.sum(~exact))
     scores = normal_scores(measurements, prediction)
     chi_squared, p_value = float(np.sum(scores[exact] ** 2)), math.nan
-    if degrees > 0 and not np.any(np.asarray(measurements.estimated)):
+    if degrees > 0 and not np.any(measurements.estimated):
         p_value = float(chdtrc(degrees, chi_squared)) if math.isfinite(chi_squared) else 0.0
-    numbers = np.asarray(measurements.series)
-    parts = [scores[exact & (numbers == number)] for number in np.unique(numbers)]
+    parts = [scores[exact & (measurements.series == number)] for number in np.unique(measurements.series)]
     orders = [runs_of_signs(part) for part in parts]
     p_values = [order.p_value for order, part in zip(orders, parts, strict=True) if np.any(np.abs(part) > NEGLIGIBLE)]
     p_trend = min(p_values, default=1.0) * max(len(p_values), 1)
@@ -182,10 +180,8 @@ def normal_scores(measurements: Measurements, prediction: PerPoint) -> PerPoint:
     """Residuals converted to numbers that are normal if the stated errors are right; 0 for limits."""
     from scipy.special import ndtri, stdtr
 
-    z = np.asarray(eqx.filter_jit(measurements.standardised)(np.asarray(prediction)))
-    freedom = np.asarray(measurements.student)
-    heavy = np.isfinite(freedom)
-    return np.where(heavy, -np.sign(z) * ndtri(stdtr(np.where(heavy, freedom, 1.0), -np.abs(z))), z)
+    z, heavy = measurements.standardised(prediction), np.isfinite(measurements.student)
+    return np.where(heavy, -np.sign(z) * ndtri(stdtr(np.where(heavy, measurements.student, 1.0), -np.abs(z))), z)
 
 
 def runs_of_signs(values: PerPoint) -> Series:
@@ -349,11 +345,9 @@ class Distribution(NamedTuple):
         if self.kind == "weights":
             # Draws without weight may be infinite.
             used = self.weights > 0.0
-            covariance = weighted_covariance(
-                np.asarray(problem.unknowns.values(self.points[used])), self.weights[used]
-            )[1]
+            _, covariance = weighted_covariance(problem.unknowns.values(self.points[used]), self.weights[used])
             ends = np.array([self.interval(k, 1.0) for k in range(len(self.estimate))])
-            low, high = np.asarray(problem.unknowns.values(ends.T))
+            low, high = problem.unknowns.values(ends.T)
             scale = 0.5 * (high - low) / np.sqrt(np.diag(covariance))
             return covariance * np.outer(scale, scale)
         with np.errstate(invalid="ignore"):
@@ -436,7 +430,7 @@ def minima_of(explorer: Explorer, sample: Pool) -> tuple[Minimum, ...]:
     minima = []
     for group in np.unique(groups):
         best = np.flatnonzero(groups == group)[np.argmax(sample.log_density[used][groups == group])]
-        values = dict(zip(problem.names, np.asarray(problem.unknowns.values(points[best])).tolist(), strict=True))
+        values = dict(zip(problem.names, problem.unknowns.values(points[best]).tolist(), strict=True))
         deviance = float(-2.0 * np.sum(sample.groups[used][best]))
         text = ", ".join(f"{name} {explorer.density.written(name, value)}" for name, value in values.items())
         minima.append(Minimum(values, float(np.sum(weights[groups == group])), deviance, text))
@@ -458,7 +452,7 @@ def roughness(explorer: Explorer, sample: Pool) -> float:
     measurements = explorer.density.measurements
     predictions = predictions - measurements.whole_periods(predictions - predictions[0])
     coefficients, *_ = np.linalg.lstsq(root * terms, root * predictions)
-    off = (predictions - terms @ coefficients) / np.asarray(measurements.error)
+    off = (predictions - terms @ coefficients) / measurements.error
     return float(np.sqrt(np.mean(np.sum(root**2 * off**2, axis=0))))
 
 
@@ -470,7 +464,7 @@ def without_prediction(explorer: Explorer, sample: Pool, distribution: Distribut
     points, failed = points[evaluated], np.any(np.isnan(sample.predictions[evaluated]), axis=1)
     if not np.any(failed):
         return "", 0.0
-    values = np.asarray(problem.unknowns.values(points[failed]))
+    values = problem.unknowns.values(points[failed])
     ends = zip(problem.names, np.min(values, axis=0), np.max(values, axis=0), strict=True)
     places = ", ".join(f"{name} {explorer.density.written(name, low, high)}" for name, low, high in ends)
     words = (

@@ -42,16 +42,13 @@ def draw_errors(
 def _by_error(measurements: Measurements, prediction: np.ndarray, residual: np.ndarray):
     """For each series of unknown error: logarithms of the error in units of its guess (rows, grid), and the log likelihood
     there."""
-    estimated = np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
-    if not np.any(estimated):
-        return
-    series, freedom = np.asarray(measurements.series), np.asarray(measurements.student)
-    difference = np.where(estimated, prediction - np.where(estimated, measurements.value, 0.0), 0.0)
-    difference = (difference - measurements.whole_periods(difference)) / np.asarray(measurements.error)
+    estimated, series = measurements.estimated & ~measurements.censored, measurements.series
+    standardised = measurements.standardised(prediction)
     for number in np.unique(series[estimated]):
         members = (series == number) & estimated
-        z = np.where(np.isfinite(difference[:, members]), difference[:, members], residual[:, members])
-        count, nu = z.shape[1], float(freedom[members][0])
+        z = standardised[:, members]
+        z = np.where(np.isfinite(z), z, residual[:, members])
+        count, nu = z.shape[1], float(measurements.student[members][0])
         reach = RANGE / np.sqrt(2.0 * count)
         scales = np.log(scale_of(z, nu))[:, None] + np.linspace(-reach, 2.0 * reach, GRID)
         logs = np.empty(scales.shape)
@@ -244,7 +241,7 @@ def region_of(density: LogDensity, spread: float) -> Region:
     **Arguments:** `spread`: greater than 1.
     """
     # 0 without recordings.
-    duration = float(np.max(np.asarray(density.measurements.time)))
+    duration = float(np.max(density.measurements.time))
     unknowns, names = density.problem.unknowns, map(own_name, density.problem.names)
     start, lower, upper = map(np.asarray, (unknowns.start, unknowns.lower, unknowns.upper))
     has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
@@ -368,7 +365,7 @@ class Explorer(NamedTuple):
     @classmethod
     def of(cls, density: LogDensity, spread: float, seed: int) -> "Explorer":
         """An explorer of the region around start values, as for `region_of`, with measurements grouped by their times."""
-        times, region = np.asarray(density.measurements.time), region_of(density, spread)
+        times, region = density.measurements.time, region_of(density, spread)
         distinct = np.unique(times)
         count = min(GROUPS, len(distinct))
         group = (np.searchsorted(distinct, times) * count) // len(distinct)
@@ -400,7 +397,7 @@ class Explorer(NamedTuple):
             predictions = self.density.predict(np.concatenate([points, moved.reshape(-1, len(middle))]))
             base, others = predictions[: len(points), None], predictions[len(points) :].reshape(*ends.shape, -1)
         with np.errstate(invalid="ignore"):
-            change = np.abs(others - base) / np.asarray(self.density.measurements.error)
+            change = np.abs(others - base) / self.density.measurements.error
         is_same = np.all((others == base) | (change < NO_CHANGE), axis=(0, 2))
         unknowns = self.density.problem.unknowns
         has_prior = np.array([prior is not None for prior in unknowns.priors])
@@ -467,7 +464,7 @@ class Explorer(NamedTuple):
         measurements = self.density.measurements
         predictions = np.asarray(self.density.predict(batch[: len(points)])) if known is None else known
         residual = compared(measurements, predictions)[0]
-        each, estimated = -0.5 * residual**2, np.asarray(measurements.estimated) & ~np.asarray(measurements.censored)
+        each, estimated = -0.5 * residual**2, measurements.estimated & ~measurements.censored
         likelihood = np.sum(each[:, ~estimated], axis=1)
         for scales, logs in _by_error(measurements, predictions, residual):
             likelihood = likelihood + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])

@@ -17,6 +17,17 @@ from ..terminal import status_line
 from ..text import in_unit, readable_unit, shown
 from ..validation import ArrayOrList, is_traced, require
 
+#: Coordinates of one point, of a point for each row, and of n points; a number for each point or measurement; and a covariance.
+Coordinates = Float[np.ndarray, " unknowns"]
+Rows = Float[np.ndarray, "rows unknowns"]
+Points = Float[np.ndarray, "n unknowns"]
+PerPoint = Float[np.ndarray, " n"]
+Matrix = Float[np.ndarray, "unknowns unknowns"]
+
+#: Predictions of all measurements in every row, and their slopes with respect to the coordinates.
+Predictions = Float[np.ndarray, "rows n"]
+Slopes = Float[np.ndarray, "rows n unknowns"]
+
 # Compare predictions with measurements: residuals whose squares add up to -2 log likelihood.
 
 #: Residual of a measurement for which the model has no prediction: a penalty without a slope.
@@ -56,14 +67,14 @@ class Measurements(eqx.Module):
     [1.0, 2.0, inf]
     """
 
-    value: Float[Array, "... n"]
-    error: Float[Array, "... n"]
-    upper: Float[Array, "... n"]
-    period: Float[Array, "... n"]
-    student: Float[Array, "... n"]
-    series: Int[Array, "... n"]
-    time: Float[Array, "... n"]
-    estimated: Bool[Array, "... n"]
+    value: Float[Array | np.ndarray, "... n"]
+    error: Float[Array | np.ndarray, "... n"]
+    upper: Float[Array | np.ndarray, "... n"]
+    period: Float[Array | np.ndarray, "... n"]
+    student: Float[Array | np.ndarray, "... n"]
+    series: Int[Array | np.ndarray, "... n"]
+    time: Float[Array | np.ndarray, "... n"]
+    estimated: Bool[Array | np.ndarray, "... n"]
 
     def __init__(
         self,
@@ -100,10 +111,10 @@ class Measurements(eqx.Module):
         fields = {"value": value, "upper": upper, "error": error, "period": period, "student": student}
         for name, argument in (fields | {"series": series, "time": time, "estimated": estimated}).items():
             kind = {"series": int, "estimated": bool}.get(name, float)
-            setattr(self, name, jnp.broadcast_to(jnp.asarray(argument, kind), shape))
+            setattr(self, name, np.broadcast_to(np.asarray(argument, kind), shape))
 
     @property
-    def censored(self) -> Bool[Array, "... n"]:
+    def censored(self) -> Bool[Array | np.ndarray, "... n"]:
         """Which measurements are limits, or pairs of limits."""
         return self.upper > self.value
 
@@ -149,11 +160,11 @@ class Measurements(eqx.Module):
         period = xp.where(wraps, period, 1.0)
         return xp.where(wraps, period * xp.round(off / period), 0.0)
 
-    def standardised(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
-        """(prediction - value) / error, with whole periods removed; 0 for limits."""
-        difference = jnp.where(self.censored, 0.0, prediction - self.value)
-        difference = difference - self.whole_periods(difference)
-        return difference / self.error
+    def standardised(self, prediction: Float[Array | np.ndarray, "... n"]) -> Any:
+        """(prediction - value) / error, with whole periods removed, as for `whole_periods`; 0 for limits."""
+        xp: Any = np if isinstance(prediction, np.ndarray) else jnp
+        difference = xp.where(self.censored, 0.0, prediction - xp.where(self.censored, 0.0, self.value))
+        return (difference - self.whole_periods(difference)) / self.error
 
     def roots_of_information(
         self, prediction: Float[Array | np.ndarray, "... n"], slope: Float[Array, "... n"]
@@ -211,21 +222,18 @@ def scale_of(off: Float[np.ndarray, "rows n"], freedom: float, share: float = 1.
     return scale
 
 
-def estimated_errors(
-    measurements: Measurements, prediction: Float[np.ndarray, " n"], unknowns: int
-) -> Float[np.ndarray, " n"]:
+def estimated_errors(measurements: Measurements, prediction: PerPoint, unknowns: int) -> PerPoint:
     """The errors; unknown errors are estimated from the residuals of their series.
 
     In a fit of k unknowns to N values, the share of the residuals that is left of the errors is 1 - k / N.
     """
-    errors = np.array(measurements.error)
-    series, estimated, freedom = map(np.asarray, (measurements.series, measurements.estimated, measurements.student))
-    off = np.asarray(measurements.standardised(prediction)) * errors
+    errors, series, estimated = np.array(measurements.error), measurements.series, measurements.estimated
+    off = measurements.standardised(prediction) * errors
     share = max(1.0 - unknowns / off.size, 1.0 / off.size)
     for number in np.unique(series[estimated]):
         members = (series == number) & estimated
-        seen = off[members & np.isfinite(off)]
-        errors[members] = scale_of(seen[None], freedom[members][0].item(), share) if len(seen) else 1.0
+        seen, freedom = off[members & np.isfinite(off)], float(measurements.student[members][0])
+        errors[members] = scale_of(seen[None], freedom, share) if len(seen) else 1.0
     return errors
 
 
@@ -400,13 +408,6 @@ def own_name(name: str) -> str:
 
 # A model with its free parameters, and predictions with slopes, for many sets of parameters at once.
 
-#: Coordinates of one point, of a point for each row, and of n points; a number for each point or measurement; and a covariance.
-Coordinates = Float[np.ndarray, " unknowns"]
-Rows = Float[np.ndarray, "rows unknowns"]
-Points = Float[np.ndarray, "n unknowns"]
-PerPoint = Float[np.ndarray, " n"]
-Matrix = Float[np.ndarray, "unknowns unknowns"]
-
 #: Number of rows in a call of a model without and with slopes; on an accelerator.
 ROWS_OF_CALL, ROWS_WITH_SLOPES, MOST_ROWS = 64, 8, 512
 
@@ -464,8 +465,8 @@ class Linearised(NamedTuple):
     """
 
     coordinates: Rows
-    prediction: Float[np.ndarray, "rows n"]
-    slopes: Float[np.ndarray, "rows n unknowns"]
+    prediction: Predictions
+    slopes: Slopes
     residual: Float[np.ndarray, "rows residuals"]
     jacobian: Float[np.ndarray, "rows residuals unknowns"]
     information: Float[np.ndarray, "rows residuals unknowns"]
@@ -548,10 +549,7 @@ def linearise(density: "LogDensity", coordinates: Rows, mask: Bool[np.ndarray, "
 
 
 def weighed(
-    density: "LogDensity",
-    coordinates: Rows,
-    prediction: Float[np.ndarray, "rows n"],
-    slopes: Float[np.ndarray, "rows n unknowns"] | None = None,
+    density: "LogDensity", coordinates: Rows, prediction: Predictions, slopes: Slopes | None = None
 ) -> Linearised:
     """Predictions, and slopes if they are known, compared with measurements and priors; without a run."""
     slopes = np.zeros((*prediction.shape, coordinates.shape[1])) if slopes is None else slopes
@@ -561,7 +559,7 @@ def weighed(
     return Linearised(coordinates, prediction, slopes, np.concatenate([residual, prior], axis=1), *of_all)
 
 
-def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]) -> list[np.ndarray]:
+def compared(measurements: Measurements, prediction: Predictions) -> list[np.ndarray]:
     """Residuals, their slopes with respect to the predictions, and the roots of the expected information.
 
     All are element by element. Lists of one length let one program serve all fits.
@@ -573,7 +571,7 @@ def compared(measurements: Measurements, prediction: Float[np.ndarray, "rows n"]
 
     lists = jax.tree.map(listed, (measurements, prediction))
     # The program of limits takes three times as long to compile.
-    has_limits = bool(np.any(np.asarray(measurements.censored)))
+    has_limits = bool(np.any(measurements.censored))
     rows = [jax.tree.map(lambda values, k=k: values[k], lists) for k in range(len(lists[1]))]
     parts = [_residuals(measured, predicted, has_limits) for measured, predicted in rows]
     return [np.concatenate(values)[: prediction.size].reshape(prediction.shape) for values in zip(*parts, strict=True)]
@@ -644,14 +642,13 @@ class LogDensity(eqx.Module):
                 checked[name] = as_gaussian(prior, unknowns[name].start, name)
             else:
                 checked[name] = prior if isinstance(prior, eqx.Module) else jax.tree_util.Partial(prior)
-        series, estimated = np.asarray(measurements.series), np.asarray(measurements.estimated)
-        recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
+        recorded = bool(np.any(measurements.time > 0.0))
         steps = {"exact": None, "differences": OF_RECORDING if recorded else DIFFERENCE}
         if not isinstance(slopes, str) or slopes not in steps:
             raise ValueError(f"slopes = {shown(slopes)} must be one of {', '.join(map(repr, steps))}")
         on_host, acts = getattr(model, "on_host", False), np.ones(len(unknowns), bool)
         problem = Problem(model, tuple(unknowns), Unknowns(unknowns, checked), steps[slopes], on_host, acts)
-        open_series = tuple(np.unique(series[estimated]).tolist())
+        open_series = tuple(np.unique(measurements.series[measurements.estimated]).tolist())
         return cls(problem, measurements, open_series, series_units)
 
     @property
@@ -697,7 +694,7 @@ class LogDensity(eqx.Module):
         unknowns = self.problem.unknowns.values(coordinates[..., :numbers])
         # The first guesses of the unknown errors, one for each series.
         mask = [self.measurements.estimated & (self.measurements.series == k) for k in self.open_series]
-        guesses = jnp.array([self.measurements.error[jnp.argmax(series)] for series in mask])
+        guesses = jnp.array([jnp.asarray(self.measurements.error)[jnp.argmax(series)] for series in mask])
         errors = guesses * jnp.exp(coordinates[..., numbers:])
         return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([unknowns, errors], axis=-1), -1, 0), strict=True))
 
@@ -719,7 +716,7 @@ class LogDensity(eqx.Module):
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
         """New measurements drawn from the predictions and their errors; limits are replaced by values."""
         random, predicted = np.random.default_rng(seed), np.asarray(self.predict(coordinates))
-        heavy = np.isfinite(freedom := np.asarray(self.measurements.student))
+        heavy = np.isfinite(freedom := self.measurements.student)
         noise = random.normal(size=predicted.shape)
         noise /= np.where(
             heavy, np.sqrt(random.chisquare(np.where(heavy, freedom, 1.0), predicted.shape) / freedom), 1.0
@@ -745,7 +742,6 @@ class LogDensity(eqx.Module):
 
     def with_errors(self, errors: Float[Array | np.ndarray, " n"]) -> "LogDensity":
         """The density for measurements with other errors."""
-        errors = jnp.broadcast_to(errors, self.measurements.error.shape)
         return eqx.tree_at(lambda density: density.measurements.error, self, errors)
 
     def _with_errors(self, coordinates: Float[Array, " unknowns"]) -> Measurements:

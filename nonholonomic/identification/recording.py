@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -100,8 +101,7 @@ class AbstractData(Stated, metaclass=Explaining):
     a value per run if there are several.
     """
 
-    #: Number of predictions, and the indices of those that were measured, ordered by time.
-    size: ClassVar[int]
+    #: Which predictions were measured, in the order of their times.
     seen: ClassVar[np.ndarray]
 
     #: What was measured, and a label for each number.
@@ -235,14 +235,9 @@ class AbstractRecording(AbstractData):
         return columns
 
     @property
-    def size(self) -> int:
-        """Number of predictions, including those of missing samples."""
-        return np.size(self.value)
-
-    @property
     def seen(self) -> np.ndarray:
-        """Indices of the samples that are not missing, ordered by time."""
-        return np.flatnonzero(~np.isnan(np.asarray(self.value).reshape(-1)))
+        """Which samples are not missing, in the order of their times."""
+        return ~np.isnan(np.asarray(self.value).reshape(-1))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -250,7 +245,7 @@ class AbstractRecording(AbstractData):
         unit, factor = in_unit("s", unit_of(self))
         times = factor * np.asarray(self.times)
         all_labels = [f"{column}({time:.4g} {unit})" for time in times for column in self.columns]
-        return tuple(all_labels[i] for i in self.seen)
+        return tuple(itertools.compress(all_labels, self.seen))
 
     def units_of(self, model: "AbstractModel") -> tuple[str, ...]:
         """The unit of each series, for the model of the run."""

@@ -201,7 +201,7 @@ class Identification:
             times = []
             for source, original in zip(shifted.model.recorded, data, strict=True):
                 offset = source.times[0] - original.times[0] if isinstance(source, AbstractRecording) else 0.0
-                times.append(np.asarray(source.measurements.time + offset))
+                times.append(source.measurements.time + offset)
             slices.append((np.concatenate(times), predictions(shifted, coordinates[None])[0]))
         times, values = zip(*slices, strict=True)
         return np.stack(times), np.stack(values)
@@ -241,7 +241,7 @@ class Identification:
         """The residuals in the unit that is shown, this unit, and the factor that converts to it. **Arguments:** `unit`: as for
         `plot`."""
         rows, units = [], dict(enumerate(self.density.series_units))
-        for row, number in zip(self.residuals, np.asarray(self.density.measurements.series).tolist(), strict=True):
+        for row, number in zip(self.residuals, self.density.measurements.series.tolist(), strict=True):
             text, factor = in_unit(units.get(number, "1"), unit or self.density.series_shown[number : number + 1])
             numbers = {name: factor * getattr(row, name) for name in ("value", "error", "prediction", "upper")}
             rows.append((row._replace(**numbers), text, factor))
@@ -619,10 +619,9 @@ def sample(
             raise ValueError(f"centre = {shown(centre)} must be of shape {(numbers,)}")
         known = Mixture(np.ones(1), np.asarray(centre, float)[None], np.linalg.cholesky(covariance)[None])
     with status_line("sampling", progress):
-        sizes = (chains, MOVES * warmup, draws)
-        coordinates, accepted, runs, excess = drawn(density, known, sizes, seed)
+        outcome = drawn(density, known, (chains, MOVES * warmup, draws), seed)
     with status_line("diagnosing the draws", progress):
-        posterior = Draws.of(density, coordinates, accepted, runs, excess)
+        posterior = Draws.of(density, *outcome)
     if words := (*(f"these are no draws from the posterior: {flaw}" for flaw in posterior.flaws), *posterior.concerns):
         warn("; ".join(words), FitWarning)
     return posterior

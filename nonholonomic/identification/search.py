@@ -13,14 +13,13 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
 from ..terminal import Progress
 from ..validation import warn
 from .exploration import FALL, Explorer, Mixture, Pool
-from .posterior import Linearised, LogDensity, Rows, estimated_errors, linearise, predictions, weighed
+from .posterior import Coordinates, Linearised, LogDensity, Rows, estimated_errors, linearise, predictions, weighed
 from .recording import AbstractRecording
 
 #: Damping of the first step, as a fraction of the squared slope with respect to each coordinate.
@@ -50,13 +49,7 @@ FARTHEST = 1.0
 ROUND_OFF = 1e-7
 
 
-def minimise(
-    density: LogDensity,
-    starts: Rows,
-    *,
-    fixed: int | None = None,
-    max_steps: int = 60,
-) -> "Minima":
+def minimise(density: LogDensity, starts: Rows, *, fixed: int | None = None, max_steps: int = 60) -> "Minima":
     """Fit every row.
 
     **Arguments:**
@@ -185,10 +178,7 @@ def _singular(slopes: Float[np.ndarray, "n unknowns"]) -> tuple[np.ndarray, np.n
 
 
 def identifiability(
-    density: LogDensity,
-    estimates: Float[np.ndarray, " unknowns"],
-    slopes: Float[np.ndarray, " unknowns"],
-    jacobian: Float[np.ndarray, "n unknowns"],
+    density: LogDensity, estimates: Coordinates, slopes: Coordinates, jacobian: Float[np.ndarray, "n unknowns"]
 ) -> Identifiability:
     """Singular values of the slopes of the residuals with respect to relative changes of the parameters, with their
     directions as text.
@@ -337,12 +327,7 @@ class Minima(NamedTuple):
         return Mixture(np.full(len(centres), 1.0 / len(centres)), np.stack(centres), np.stack(roots))
 
 
-def refine(
-    density: LogDensity,
-    starts: Rows,
-    max_steps: int,
-    in_parts: bool = False,
-) -> Minima:
+def refine(density: LogDensity, starts: Rows, max_steps: int, in_parts: bool = False) -> Minima:
     """Fit every row, and estimate unknown errors from the residuals of the best.
 
     **Arguments:** `in_parts`: whether recordings are also fitted in stages, of which the better of the two ends counts;
@@ -350,12 +335,12 @@ def refine(
     """
     measurements = density.measurements
     if in_parts:
-        duration = float(np.max(np.asarray(measurements.time)))
+        duration = float(np.max(measurements.time))
         steps, coordinates = min(max_steps, AT_ONCE), starts
         minima = minimise(density, starts, max_steps=steps)
         for part in PARTS:
             # Later measurements have nearly no weight.
-            factor = jnp.where(measurements.time > part * duration, DOWN_WEIGHTED, 1.0)
+            factor = np.where(measurements.time > part * duration, DOWN_WEIGHTED, 1.0)
             early = density.with_errors(measurements.error * factor)
             coordinates = minimise(early, coordinates, max_steps=min(max_steps, OF_PART)).coordinates
         by_parts = minimise(density, coordinates, max_steps=2 * steps)
@@ -363,10 +348,10 @@ def refine(
         minima = Minima._make((starts, *chosen(improves, by_parts[1:3], minima[1:3]), density))
     else:
         minima = minimise(density, starts, max_steps=max_steps)
-    for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
+    for _ in range(ROUNDS if np.any(measurements.estimated) else 0):
         best = minima.linearised.prediction[np.argmin(minima.linearised.deviance)]
         errors = estimated_errors(density.measurements, best, starts.shape[1])
-        change = np.max(np.abs(np.log(errors / np.asarray(density.measurements.error))))
+        change = np.max(np.abs(np.log(errors / density.measurements.error)))
         density = density.with_errors(errors)
         if change <= SETTLED:
             minima = minima.weighed(density)
@@ -437,7 +422,7 @@ def search(explorer: Explorer, starts: int, max_steps: int) -> tuple[Explorer, M
         )
     density = eqx.tree_at(lambda density: density.problem.acts, explorer.density, acts)
     explorer = explorer._replace(density=density)
-    recorded = bool(np.any(np.asarray(measurements.time) > 0.0))
+    recorded = bool(np.any(measurements.time > 0.0))
     steps = max_steps if recorded else min(max_steps, FEW_STEPS)
     # Whether there is a single unknown, and the density falls towards both ends of its range.
     is_bounded = len(problem.names) == 1 and bool(np.all(pool.log_density[[0, -1]] < np.max(pool.log_density) - FALL))
@@ -446,7 +431,7 @@ def search(explorer: Explorer, starts: int, max_steps: int) -> tuple[Explorer, M
         sample = explorer.explore(pool, None)
         place = sample.most_probable(min(starts, LAST if recorded else 1))
         best = sample.points[place]
-        if recorded or not sample.enough or np.any(np.asarray(measurements.estimated)):
+        if recorded or not sample.enough or np.any(measurements.estimated):
             return explorer, refine(density, best, steps), sample
         # Among so many points of a single unknown, the best is close to the minimum, and those around it show the slopes.
         beside = best[0] + problem.step * np.array([-1.0, 1.0])
@@ -482,10 +467,10 @@ def _refuse_milliseconds(explorer: Explorer, pool: Pool | None) -> None:
     if not data:
         return
     recorded = [isinstance(source, AbstractRecording) for source in data]
-    is_sample = np.repeat(recorded, [len(source.seen) for source in data])
-    value, error, series = map(np.asarray, (measurements.value, measurements.error, measurements.series))
+    is_sample = np.repeat(recorded, [np.count_nonzero(source.seen) for source in data])
+    value, series = measurements.value, measurements.series
     points = explorer.region.points(FEW_CANDIDATES, 0)
-    is_event = ~is_sample & ~np.asarray(measurements.censored)
+    is_event = ~is_sample & ~measurements.censored
     if np.any(is_event):
         first = predictions(problem, points[:1]) if pool is None else pool.predictions
         ratio = np.median(value[is_event] / first[0, is_event])
@@ -498,11 +483,10 @@ def _refuse_milliseconds(explorer: Explorer, pool: Pool | None) -> None:
     if min((np.median(np.diff(source.times)) for source in recordings if len(source.times) > 2), default=0.0) < SPARSE:
         return
     model = problem.model.with_times(lambda source: {"times": 1e-3 * source.times, "t0": 1e-3 * source.t0})
-    off = predictions(eqx.tree_at(lambda problem: problem.model, problem, model), points) - value
-    off = off - measurements.whole_periods(off)
+    off = measurements.standardised(predictions(eqx.tree_at(lambda problem: problem.model, problem, model), points))
     # Candidates whose runs fail have no prediction.
-    least = np.fmin.reduce(np.sum((off / error)[:, is_sample] ** 2, axis=1))
-    parts = [(value / error)[is_sample & (series == number)] for number in np.unique(series[is_sample])]
+    least = np.fmin.reduce(np.sum(off[:, is_sample] ** 2, axis=1))
+    parts = [(value / measurements.error)[is_sample & (series == number)] for number in np.unique(series[is_sample])]
     if least < EXPLAINED * sum(part.size * np.var(part) for part in parts):
         raise ValueError(
             "times: the model explains the samples at 1e-3 * times; times are in seconds: did you mean 1e-3 * times? "

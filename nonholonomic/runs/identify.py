@@ -180,14 +180,9 @@ class AbstractEventTimes(AbstractData):
         return self.t1 + BEYOND * jnp.max(self.error)
 
     @property
-    def size(self) -> int:
-        """Number of predictions."""
-        return len(self.time)
-
-    @property
-    def seen(self) -> Int[np.ndarray, " n"]:
-        """Indices of the measured predictions, which are all predictions."""
-        return np.arange(self.size)
+    def seen(self) -> Bool[np.ndarray, " n"]:
+        """Which predictions were measured: all of them."""
+        return np.ones(len(self.time), bool)
 
     def units_of(self, model: AbstractModel) -> tuple[str, ...]:
         """The unit of the only series of the measurements."""
@@ -586,8 +581,7 @@ def posterior_of_runs(
     unknowns = free_numbers(free, sources)
     require_apart("free", unknowns)
     require_room(sources[0].model, unknowns)
-    offsets = np.cumsum([0, *(source.size for source in several)])
-    seen = np.concatenate([first + source.seen for first, source in zip(offsets, several, strict=False)])
+    seen = np.flatnonzero(np.concatenate([source.seen for source in several]))
     first, own = sources[0].model, set(map(own_name, unknowns))
     starts = [name for name in first.known if name.startswith(("launch.", "start")) and name not in own]
     fixed = tuple(name for name in starts if np.ndim(first.value(name)) == 0 and np.any(first.value(name)))
@@ -606,7 +600,7 @@ def posterior_of_runs(
         own = source.data.units_of(source.model)[: int(np.max(part.series)) + 1]
         units += own
         series_shown += [in_unit(si, unit_of(source.data))[0] for si in own]
-    measurements = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    measurements = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     density = LogDensity.of(model, measurements, unknowns, by_name, tuple(units), slopes or model.slopes(unknowns))
     label, shorts = sources[0].model.label, map(own_name, unknowns)
     own_units = tuple("s" if short == "t0" else label([short])[short][1] for short in shorts)

@@ -246,7 +246,7 @@ def sweep(
     chunk_size = chunk_for(cells) if chunk is None else chunk
     chunk_size = chunk_size if most is None else min(chunk_size, most)
     layout = layout_of(axes, inner, variables, request, chunk_size)
-    layout = layout._replace(chunk=chunk_size * chunks_together(layout, chunk_size))
+    layout = layout._replace(chunk=chunk_size * chunks_together(layout))
     forget_programs_if_many()
     work = ChunkTask(job, axes, chunk_size)
     required, room = layout.bytes_of_cells(layout.cells), memory_of_machine()
@@ -255,19 +255,17 @@ def sweep(
         raise ValueError(f"path = None: {sizes}; pass path= to keep them in a file")
     store = None if path is None else ChunkStore(path, layout)
     try:
-        with no_interrupt_lost() as raise_lost_interrupt:
-            finished = set() if store is None else store.finished
-            chunks = computed(work, layout, finished, executor, progress, raise_lost_interrupt)
-            # Ctrl-C may arrive while a chunk is saved. The traceback would then keep `chunks` alive, and its workers busy.
-            with contextlib.closing(chunks):
-                if store is not None:
-                    store.fill(chunks)
-                    return Table.load(store.path)
-                of_all_cells = layout.empty(layout.cells)
-                for number, values in chunks:
-                    for name, of_variable in of_all_cells.items():
-                        of_variable[slice(*layout.ends(number))] = values[name]
-                return Table.laid_out(layout, {name: layout.shaped(name, part) for name, part in of_all_cells.items()})
+        chunks = computed(work, layout, set() if store is None else store.finished, executor, progress)
+        # Ctrl-C may arrive while a chunk is saved. The traceback would then keep `chunks` alive, and its workers busy.
+        with contextlib.closing(chunks):
+            if store is not None:
+                store.fill(chunks)
+                return Table.load(store.path)
+            of_all_cells = layout.empty(layout.cells)
+            for number, values in chunks:
+                for name, of_variable in of_all_cells.items():
+                    of_variable[slice(*layout.ends(number))] = values[name]
+            return Table.laid_out(layout, {name: layout.shaped(name, part) for name, part in of_all_cells.items()})
     except KeyboardInterrupt:
         none_saved = f"interrupted; without path=, none of {with_spaces(layout.cells)} cells is saved"
         raise KeyboardInterrupt(none_saved if store is None else store.interrupted()) from None
@@ -281,17 +279,14 @@ def sweep(
 
 
 def computed(
-    work: ChunkTask,
-    layout: Layout,
-    finished: set[int],
-    executor: Executor | None,
-    progress: bool,
-    raise_lost_interrupt: Callable[[], None],
+    work: ChunkTask, layout: Layout, finished: set[int], executor: Executor | None, progress: bool
 ) -> Generator[tuple[int, dict[str, Values]], None, None]:
     """Compute the unfinished chunks, and yield each when it is finished; see `sweep`."""
     todo = [chunk for chunk in range(layout.chunks) if chunk not in finished]
     finished_cells = layout.cells - sum(map(layout.size, todo))
-    with Progress(layout.cells, "cell", shown=progress) as display, contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
+        raise_lost_interrupt = stack.enter_context(no_interrupt_lost())
+        display = stack.enter_context(Progress(layout.cells, "cell", shown=progress))
         is_compiled, pool = executor is None, executor
         if pool is None:
             pool = ThreadPoolExecutor(workers())
@@ -384,9 +379,9 @@ def chunk_for(cells: int) -> int:
     return 64 if cells <= 64 else 128 if cells <= 4096 else 512
 
 
-def chunks_together(layout: Layout, chunk: int) -> int:
+def chunks_together(layout: Layout) -> int:
     """Number of chunks that are dispatched and stored together, a power of two, greater than one for large grids."""
-    count = min(layout.cells // (CHUNKS * chunk), MOST_BYTES // layout.bytes_of_cells(chunk))
+    count = min(layout.cells // (CHUNKS * layout.chunk), MOST_BYTES // layout.bytes_of_cells(layout.chunk))
     return 1 << max(count, 1).bit_length() - 1
 
 

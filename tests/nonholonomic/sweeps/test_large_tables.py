@@ -93,7 +93,7 @@ def test_large_grids_have_larger_blocks(cells, together):
     """About a thousand, until a block takes 2 MB."""
     kinds = dict.fromkeys(["time", "end_time", "end_theta", "steps", "rejected"], np.dtype(float))
     layout = Layout({"x": np.empty(cells, np.bool_)}, kinds, {}, {}, {}, {}, 512, {})
-    assert running.chunks_together(layout, 512) == together
+    assert running.chunks_together(layout) == together
 
 
 def test_a_small_grid_is_checked_whole_and_a_large_one_at_its_edges_and_corners():
