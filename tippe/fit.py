@@ -11,17 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic import identification
 from nonholonomic.derivatives import differentiable_solve
-from nonholonomic.identification import (
-    AbstractRecording,
-    Free,
-    Identification,
-    LogDensity,
-    Quantities,
-    as_quantity,
-    read_columns,
-    read_launches,
-)
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers
 from nonholonomic.runs.identify import AbstractEventTimes, Cells, Data, Prior, fit_runs, posterior_of_runs
@@ -42,7 +33,7 @@ EXPECTED = "an InversionTimes, a ReversalTimes or a Recording"
 def identify(
     scene: Scene,
     data: Data | Sequence[Data],
-    free: Mapping[str, Free | float],
+    free: Mapping[str, identification.Free | float],
     *,
     starts: int = 16,
     spread: float = 2.0,
@@ -51,7 +42,7 @@ def identify(
     max_steps: int = 60,
     slopes: str | None = None,
     progress: bool = True,
-) -> Identification:
+) -> identification.Identification:
     """Estimate parameters of a scene and its launches from measurements, with errors and undetermined combinations.
 
     **Arguments:**
@@ -100,11 +91,11 @@ def identify(
 def log_density(
     scene: Scene,
     data: Data | Sequence[Data],
-    free: Mapping[str, Free | float],
+    free: Mapping[str, identification.Free | float],
     priors: Mapping[str, Prior] | None = None,
     *,
     tolerance: float = 1e-8,
-) -> LogDensity:
+) -> identification.LogDensity:
     """The log of the posterior density of a scene's parameters, as a function of unbounded coordinates.
 
     The coordinate of a parameter that cannot be negative is its logarithm (see `Free`). A parameter without a prior has
@@ -319,7 +310,7 @@ def read_inversion_times(
     >>> print(data.time, data.launch.spin.round(1))
     [3.47 3.49  inf] [115.2 146.6  62.8]
     """
-    table = read_launches(path, columns, error, UNITS, decimal, never)
+    table = identification.read_launches(path, columns, error, UNITS, decimal, never)
     for name, (least, greatest) in LIMITS.items():
         for line, value in zip(table.lines, table.numbers[name], strict=True) if name in table.numbers else ():
             if not least <= value <= greatest:
@@ -346,7 +337,7 @@ def read_inversion_times(
 # Recorded runs of tops, from arrays and from files.
 
 #: The quantities of a top that can be recorded, with the names of a `Trajectory`'s properties.
-QUANTITIES = Quantities(
+QUANTITIES = identification.Quantities(
     columns={"position": ("x", "y", "z"), "axis": ("axis_x", "axis_y", "axis_z")},
     units={"theta": "rad", "azimuth": "rad", "eta": "rad", "spin": "rad/s"}
     | dict.fromkeys(("x", "y", "z"), "m")
@@ -360,7 +351,7 @@ QUANTITIES = Quantities(
 NOISE = 0.3
 
 
-class Recording(AbstractRecording):
+class Recording(identification.AbstractRecording):
     """A recorded run: quantities sampled at the times of a clock.
 
     **Arguments:**
@@ -390,8 +381,8 @@ class Recording(AbstractRecording):
     """
 
     launch: Launch
-    quantity: str | tuple[str, ...] = eqx.field(static=True, default="theta", converter=as_quantity)
-    quantities: ClassVar[Quantities] = QUANTITIES
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="theta", converter=identification.as_quantity)
+    quantities: ClassVar[identification.Quantities] = QUANTITIES
 
     def model(self, scene: object) -> AbstractModel:
         """The model of the recorded run."""
@@ -468,5 +459,5 @@ def read_recording(
     >>> print(film.times, film.value.round(4))
     [0.   0.04] [0.0995 0.11  ]
     """
-    table = read_columns(path, columns, fps, error, QUANTITIES, decimal)
+    table = identification.read_columns(path, columns, fps, error, QUANTITIES, decimal)
     return Recording(launch, *table[:-1], t0, student).stated_in(table.unit)

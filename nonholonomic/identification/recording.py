@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -245,7 +244,7 @@ class AbstractRecording(AbstractData):
         unit, factor = in_unit("s", unit_of(self))
         times = factor * np.asarray(self.times)
         all_labels = [f"{column}({time:.4g} {unit})" for time in times for column in self.columns]
-        return tuple(itertools.compress(all_labels, self.seen))
+        return tuple(label for label, is_seen in zip(all_labels, self.seen, strict=True) if is_seen)
 
     def units_of(self, model: "AbstractModel") -> tuple[str, ...]:
         """The unit of each series, for the model of the run."""

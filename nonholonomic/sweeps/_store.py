@@ -151,15 +151,23 @@ def _describe(stream: Stream, layout: Layout) -> dict[str, int]:
     # The import takes a tenth of a second, and most processes do not need it.
     import h5py
 
+    def describe(node: h5py.HLObject, name: str, value: object) -> None:
+        """Set an attribute; a string has its own length, because no checksum covers HDF5's strings of variable length."""
+        if isinstance(value, str):
+            data = value.encode()
+            node.attrs.create(name, data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
+        else:
+            node.attrs.create(name, value)
+
     with h5py.File(stream, "w", libver=("v110", "v110"), track_order=True) as file:
         for name, value in (layout.attributes | {"Conventions": "CF-1.10"}).items():
-            _set(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
+            describe(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
         checksums = file.create_group(CHECKSUMS)
         words = {name: values.tolist() for name, values in layout.coords.items() if values.dtype.kind == "U"}
         names = {"coords": dict.fromkeys(layout.coords) | words, "kinds": list(layout.kinds)}
         text = json.dumps(layout._asdict() | names)
-        _set(checksums, LAYOUT, text)
-        _set(checksums, OF_LAYOUT, zlib.crc32(text.encode()))
+        describe(checksums, LAYOUT, text)
+        describe(checksums, OF_LAYOUT, zlib.crc32(text.encode()))
         meanings = layout.words | words
         for name, values in layout.coords.items():
             codes = np.arange(len(values), dtype=np.int8)
@@ -181,26 +189,14 @@ def _describe(stream: Stream, layout: Layout) -> dict[str, int]:
                 text = " ".join(meanings[name])
                 if text.split() != list(meanings[name]):
                     raise ValueError(f"the words of {name} must not have spaces or be empty: {tuple(meanings[name])}")
-                _set(file[name], "flag_meanings", text)
+                describe(file[name], "flag_meanings", text)
             else:
-                _set(file[name], "units", layout.units.get(name, "1"))
+                describe(file[name], "units", layout.units.get(name, "1"))
             if name in layout.long_names:
-                _set(file[name], "long_name", layout.long_names[name])
+                describe(file[name], "long_name", layout.long_names[name])
         places = _places(file)
     stream.check()
     return places
-
-
-def _set(node: "h5py.HLObject", name: str, value: object) -> None:
-    """Set an attribute; a string is stored at its own length, because no checksum covers HDF5's strings of variable length."""
-    # Only files need it.
-    import h5py
-
-    if isinstance(value, str):
-        data = value.encode()
-        node.attrs.create(name, data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
-    else:
-        node.attrs.create(name, value)
 
 
 def _places(file: "h5py.File") -> dict[str, int]:
