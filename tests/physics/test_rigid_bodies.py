@@ -95,7 +95,7 @@ def test_accelerations_and_forces_are_those_of_an_independent_program(rolls):
     rate = np.asarray(scene.dynamics.field(states))
     slide = None if rolls else lambda v: -0.3 * v / math.hypot(*v, 0.05)
     reference = Rattleback(*ODD, ODD_INERTIA, slide)
-    turning = np.stack(scene.angular_velocity(states))
+    turning = np.stack(scene.dynamics.rotation(states)[0])
     rise = np.asarray(jax.jvp(scene.path_from_frame, (states,), (jnp.asarray(rate),))[1][2])
     for k, state in enumerate(np.asarray(states).T):
         Q = np.stack([state[8:11], np.cross(state[2:5], state[8:11]), state[2:5]], axis=1)
@@ -135,7 +135,7 @@ def test_chaplygins_ball_keeps_its_integrals():
     states = any_states(100)
 
     def about_contact(state):
-        w = jnp.stack(scene.angular_velocity(state))
+        w = jnp.stack(scene.dynamics.rotation(state)[0])
         return state[5:8] + 0.1 * 0.02**2 * (w - UP[:, None] * w[2])
 
     rate = jax.jvp(about_contact, (states,), (scene.field(states),))[1]

@@ -68,7 +68,7 @@ def test_forces_and_contact_are_those_of_an_independent_program(name, rolls):
         jnp.broadcast_arrays(*(part for axis in frame.pose(*place_and_path).axes for part in axis))
     ).reshape(3, 3, 10)
     foot = np.array(jnp.broadcast_arrays(*frame.pose(*place_and_path).position))
-    turning, slip = np.stack(scene.angular_velocity(states)), np.asarray(scene.slip_velocity(states))
+    turning, slip = np.stack(scene.dynamics.rotation(states)[0]), np.asarray(scene.slip_velocity(states))
     for k, state in enumerate(np.asarray(states).T):
         to_fixed = axes[:, :, k].T
         Q = to_fixed @ np.stack([state[-3:], np.cross(state[2:5], state[-3:]), state[2:5]], axis=1)

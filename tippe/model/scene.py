@@ -515,12 +515,8 @@ class Scene(Bounded, Generic[Body]):
         """Angular velocity about the axis, w.e [rad/s]."""
         _, e, L, _ = parts(state)
         if isinstance(self.body, AbstractRigidBody):
-            return dot(e, self.angular_velocity(state))
+            return dot(e, self.dynamics.rotation(state)[0])
         return dot(e, L) / self.body.I3
-
-    def angular_velocity(self, state: States) -> Vector:
-        """Angular velocity of the body in the moving frame [rad/s]."""
-        return self.dynamics.rotation(state)[0]
 
     def path_from_frame(self, state: States) -> Vector:
         """Vector from the point with which the frame moves to the point whose path is reported [m], in the moving

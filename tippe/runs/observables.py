@@ -126,9 +126,6 @@ class AbstractTrajectory(AbstractRun):
     start: Any = None
     launch: Launch | None = None
 
-    #: The fields that no observable needs.
-    unused: ClassVar[tuple[str, ...]] = ("status", "end_time", "stats", "dense", "launch")
-
     #: The fields with a value for each time, along the last axis.
     by_time: ClassVar[tuple[str, ...]] = ("t", "states", "cyclic", "spin_angle", "work")
 
@@ -145,10 +142,9 @@ class AbstractTrajectory(AbstractRun):
     energy: ClassVar[Float[Array, " times"]]
 
     def padded(self) -> Self:
-        """The run with its last time repeated, up to a power of two, and without fields that observables do not
-        need."""
-        arrays = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
-        return dataclasses.replace(self, **arrays, **(dict.fromkeys(self.unused, None) | {"stats": {}}))
+        """The run with its last time repeated, up to a power of two, and only with the fields that observables need."""
+        arrays: Any = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
+        return type(self)(scene=self.scene, start=self.start, **arrays)
 
     @classmethod
     def parts_of(cls, scene: Scene, rows: Values, mode: Values | None, core: int) -> dict[str, Any]:
@@ -320,7 +316,7 @@ class AbstractTrajectory(AbstractRun):
     @of_each_run
     def angular_velocity(self) -> Float[Array, "times 3"]:
         """Angular velocity of the body [rad/s]."""
-        return self._fixed(self.scene.angular_velocity(self.states))
+        return self._fixed(self.scene.dynamics.rotation(self.states)[0])
 
     @of_each_run
     def rotation(self) -> Float[Array, "times 3 3"]:

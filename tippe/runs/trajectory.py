@@ -113,7 +113,7 @@ class Trajectory(AbstractTrajectory):
     @of_each_run
     def normal_spin(self) -> Float[Array, " times"]:
         """Angular velocity about the arena's normal [rad/s]."""
-        return self.scene.angular_velocity(self.states)[2]
+        return self.scene.dynamics.normal_spin(self.states)
 
     @of_each_run
     def contact(self) -> Float[Array, "times 3"]:
@@ -183,7 +183,6 @@ class HybridTrajectory(AbstractTrajectory):
     contact: Any = None
     hops: Float[np.ndarray, "hops 2"] | None = None
 
-    unused = (*AbstractTrajectory.unused, "hops")
     by_time = (*AbstractTrajectory.by_time, "distance", "contact")
 
     @property
