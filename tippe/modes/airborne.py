@@ -24,7 +24,7 @@ from nonholonomic.integration import AbstractPassive, AbstractProblem, Component
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED
 
 from ..model.body import Top
-from ..model.dynamics import COS_THETA, Dynamics, from_frame, joined, parts, to_frame
+from ..model.dynamics import COS_THETA, Dynamics, Motion, from_frame, joined, parts, to_frame
 from ..model.scene import Scene
 from .impact import (
     TOUCHING,
@@ -240,6 +240,30 @@ def lift_off(scene: Scene[Top], state: States, with_quadratures: bool, ball: Bal
         return flight
     c_vector = from_frame(tuple(state[OWN + k] for k in range(3)), axes)
     return jnp.concatenate([flight, jnp.stack(c_vector), state[OWN + 3 :]])
+
+
+def as_if_flying(scene: Scene[Top], state: States, above: tuple[Component, Component]) -> FlightState:
+    """A top as if in flight, also in contact. **Arguments:** `state`: as in contact of its own sphere; `above`: the distance of
+    this sphere from the arena [m], and its rate [m/s]."""
+    main, (distance, rate) = balls(scene.body)[0], above
+    # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
+    flying = flight_state(lift_off(scene, state, False, Ball(main.offset, main.radius + distance)))
+    normal_velocity = scale(rate, carried_frame(scene).normal(parts(state).place[:3]))
+    return flying._replace(velocity=sum_vectors(flying.velocity, normal_velocity))
+
+
+def motion_on_stem(scene: Scene[Top], state: States, above: tuple[Component, Component]) -> Motion:
+    """The motion on the stem of a top whose stem touches the arena; the first tangent is the projection of that of `state`.
+
+    **Arguments:** as for `as_if_flying`.
+    """
+    stem = balls(scene.body)[1]
+    if scene.flies_in_closed_form:
+        return standing_on(scene.dynamics, stem).motion(state)
+    flying = as_if_flying(scene, state, above)
+    ground = below(scene, flying, stem)
+    ground = ground._replace(axes=carried_frame(scene).own_axes((*ground.foot, *parts(state).place[3:])))
+    return standing(scene, stem).motion(in_contact(ground, flying_body(scene, flying, ground, stem)))
 
 
 # The modes. A top that slides on its stem has a separate frame, which moves with the stem's sphere: its origin is the foot

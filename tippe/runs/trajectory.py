@@ -29,23 +29,10 @@ from nonholonomic.text import shown
 from nonholonomic.validation import ArrayOrList, as_number, is_traced, nan_unless
 
 from ..friction import length
-from ..model.dynamics import Motion, parts
 from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
-from ..modes.airborne import (
-    FLYING,
-    ON_STEM,
-    STRIKING,
-    FlightState,
-    below,
-    carried_frame,
-    flight_state,
-    flying_body,
-    in_contact,
-    lift_off,
-    standing,
-)
-from ..modes.impact import BOTH, TOUCHING, Ball, balls, standing_on
+from ..modes.airborne import FLYING, ON_STEM, STRIKING, as_if_flying, below, carried_frame, motion_on_stem
+from ..modes.impact import BOTH, TOUCHING, balls
 from ..modes.plane import MOST_BOUNCES, height
 from ..modes.sticking import lifted
 from .observables import AbstractTrajectory, Values, audited, of_each_run
@@ -234,29 +221,7 @@ class HybridTrajectory(AbstractTrajectory):
         main, stem = balls(self.scene.body)
         if self.scene.flies_in_closed_form:
             return self.above[0] + height(main, stem, self.states)
-        return below(self.scene, self._flying, stem).gap
-
-    @property
-    def _flying(self) -> FlightState:
-        """The top over any arena as if in flight, also in contact."""
-        scene, place, (distance, rate) = self.scene, parts(self.states).place, self.above
-        main = balls(scene.body)[0]
-        # The flying top is treated as one whose own sphere is larger by the distance, so that this sphere touches.
-        flying = flight_state(lift_off(scene, self.states, False, Ball(main.offset, main.radius + distance)))
-        normal_velocity = scale(rate, carried_frame(scene).normal(place[:3]))
-        return flying._replace(velocity=sum_vectors(flying.velocity, normal_velocity))
-
-    @property
-    def _on_stem(self) -> Motion:
-        """The motion on the stem, at times at which the stem touches; the first tangent is the projection of the
-        reported one."""
-        scene, stem = self.scene, balls(self.scene.body)[1]
-        if scene.flies_in_closed_form:
-            return standing_on(scene.dynamics, stem).motion(self.states)
-        flying = self._flying
-        ground = below(scene, flying, stem)
-        ground = ground._replace(axes=carried_frame(scene).own_axes((*ground.foot, *parts(self.states).place[3:])))
-        return standing(scene, stem).motion(in_contact(ground, flying_body(scene, flying, ground, stem)))
+        return below(self.scene, as_if_flying(self.scene, self.states, self.above), stem).gap
 
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
@@ -268,7 +233,8 @@ class HybridTrajectory(AbstractTrajectory):
         """Normal force [N]; 0 in flight. If both spheres touch, this is the sum of both forces, the weight."""
         force = self.scene.normal_force(self.states)
         if self.scene.has_stem:
-            force = jnp.where(self.contact == 1, self._on_stem.normal_force, force)
+            on_stem = motion_on_stem(self.scene, self.states, self.above)
+            force = jnp.where(self.contact == 1, on_stem.normal_force, force)
             force = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, force)
         return jnp.where(self.contact < 0, 0.0, force)
 
@@ -278,7 +244,7 @@ class HybridTrajectory(AbstractTrajectory):
         sphere while it alone touches, otherwise of the top's own."""
         slip = self.scene.slip_velocity(self.states)
         if self.scene.has_stem:
-            of_stem = self._on_stem.slip
+            of_stem = motion_on_stem(self.scene, self.states, self.above).slip
             slip = jnp.where(self.contact == 1, jnp.stack([of_stem.x, of_stem.y]), slip)
         return slip.T
 
