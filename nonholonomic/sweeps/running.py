@@ -25,7 +25,7 @@ import numpy as np
 from ..compilation.cache import forget_programs_if_many, memory_of_machine
 from ..terminal import Progress
 from ..text import shown
-from ..validation import require, require_flag, warn
+from ..validation import require_flag, require_whole, warn
 from ._store import ChunkStore, with_spaces
 from .grid import Axis, Layout, Values, Variable, attributes_of, columns, size_of, versions
 from .table import Table
@@ -446,7 +446,7 @@ def local_processes(n: int, threads: int = 1) -> Executor:
 
     **Returns:** the executor, as a context.
 
-    **Raises:** `ValueError` for numbers below 1.
+    **Raises:** `ValueError` unless both are whole numbers of at least 1.
 
     **Example:** pass it to a table as `executor=processes`.
 
@@ -458,11 +458,9 @@ def local_processes(n: int, threads: int = 1) -> Executor:
 
     ```
     """
-    for name, value in (("n", n), ("threads", threads)):
-        require(value, name, at_least=1)
-        if value != int(value):
-            raise ValueError(f"{name} = {shown(value)} must be a whole number")
-    return LocalProcesses(int(n), int(threads))
+    require_whole(n, "n", 1)
+    require_whole(threads, "threads", 1)
+    return LocalProcesses(n, threads)
 
 
 #: The arguments and the result of a call.
