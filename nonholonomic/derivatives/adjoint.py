@@ -18,7 +18,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.xla_cpu import compiled_alone, uncounted, written_by_component, written_in_place
@@ -32,12 +31,13 @@ from .variation import (
     Tangent,
     Tangents,
     VariationalProblem,
-    in_groups,
+    delay,
     moving_leaves,
     slopes_by_variations,
     tangent_scale,
     tangents_of,
     where_active,
+    with_cells,
 )
 
 # The periods of an ensemble solve that are kept for its adjoint: where some of them begin and end, and the steps of the
@@ -71,42 +71,31 @@ Period: TypeAlias = PyTree
 
 
 class Checkpoints(NamedTuple):
-    """Some of the periods, the earliest first.
+    """Some of the periods, and their numbers, -1 in free places."""
 
-    There are `depth` of them; `index` holds their numbers, `slot` their places in `periods`.
-    """
-
-    depth: Int[Array, ""]
-    index: Int[Array, " slots"]
-    slot: Int[Array, " slots"]
+    numbers: Int[Array, " slots"]
     periods: Period
 
     @classmethod
     def none(cls, example: Period) -> "Checkpoints":
         """No periods. **Arguments:** `example`: a period, for the shapes."""
         room = jax.tree.map(lambda leaf: jnp.zeros((SLOTS, *leaf.shape), leaf.dtype), example)
-        return cls(jnp.zeros((), int), jnp.zeros(SLOTS, int), jnp.arange(SLOTS), room)
+        return cls(jnp.full(SLOTS, -1), room)
 
     def latest(self) -> tuple[Int[Array, ""], Period, "Checkpoints"]:
-        """The number of the latest period, the period, and the checkpoints without it."""
-        last = self.depth - 1
-        period = jax.tree.map(functools.partial(read, index=self.slot[last]), self.periods)
-        return self.index[last], period, self._replace(depth=last)
+        """The number of the latest period, -1 if there is none, the period, and the checkpoints without it."""
+        slot = jnp.argmax(self.numbers)
+        period = jax.tree.map(functools.partial(read, index=slot), self.periods)
+        return self.numbers[slot], period, self._replace(numbers=self.numbers.at[slot].set(-1))
 
-    def added(self, index: Int[Array, ""], period: Period) -> "Checkpoints":
-        """Add a period; if all slots are full, drop the period whose neighbours are closest."""
-        position = jnp.arange(SLOTS)
-        is_full = self.depth == SLOTS
-        following = jnp.where(position == SLOTS - 1, index, jnp.roll(self.index, -1))
-        gap = jnp.where(position == 0, jnp.iinfo(self.index.dtype).max, following - jnp.roll(self.index, 1))
-        victim = jnp.where(is_full, jnp.argmin(gap), self.depth)
-        free = self.slot[victim]
-        shifts = is_full & (position >= victim)
-        end = jnp.minimum(self.depth, SLOTS - 1)
-        indices = jnp.where(shifts, jnp.roll(self.index, -1), self.index).at[end].set(index)
-        slots = jnp.where(shifts, jnp.roll(self.slot, -1), self.slot).at[end].set(free)
-        room = written_in_place(self.periods, period, at=free)
-        return Checkpoints(jnp.minimum(self.depth + 1, SLOTS), indices, slots, room)
+    def added(self, number: Int[Array, ""], period: Period) -> "Checkpoints":
+        """Add a period; if all places are taken, drop the period whose neighbours are closest, but not the first."""
+        order = jnp.argsort(self.numbers)
+        earlier = self.numbers[order]
+        gaps = jnp.append(earlier[2:], number) - earlier[:-1]
+        slot = order[jnp.where(earlier[0] < 0, 0, 1 + jnp.argmin(gaps))]
+        room = written_in_place(self.periods, period, at=slot)
+        return Checkpoints(self.numbers.at[slot].set(number), room)
 
 
 class LatestSteps(NamedTuple):
@@ -204,7 +193,7 @@ def there_and_back(
 
     def is_next(run: Passes) -> Bool[Array, ""]:
         number, part, _ = run.checkpoints.latest()
-        is_next = (run.checkpoints.depth > 0) & (number == run.limit - 1)
+        is_next = (number >= 0) & (number == run.limit - 1)
         return uncounted(is_next & is_kept(part, run.other), run.number)
 
     def taken_back(run: Passes) -> Passes:
@@ -275,20 +264,24 @@ class StepRecorder(Recorder):
         # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
         return jnp.where(steps.fixed, 0.0, jnp.moveaxis(rows, -1, 1))
 
-    def measured(self, problem: AbstractProblem, lane_state: LaneState) -> PyTree:
-        """The quantities to differentiate, for lanes that have ended: the time of the event; or the time at which a run
-        leaves the domain, and the state."""
-        time, state = lane_state.time, lane_state.state
-        if self.times is None:
-            return time_of_zero(problem, problem.event_function, time, state)
-        if problem.domain_margin(time, state) is None:
-            return jnp.zeros_like(time), state
-        return time_of_zero(problem, lambda state: problem.domain_margin(time, state), time, state), state
+    def end(self, problem: AbstractProblem, time: Lanes, state: States) -> Lanes | None:
+        """The function of the state that vanishes at the end of a run whose time is differentiated."""
+        return problem.event_function(state) if self.times is None else problem.domain_margin(time, state)
 
-    def share_of_end(self, lane_state: LaneState) -> PyTree:
+    def measured(self, problem: AbstractProblem, lane_state: LaneState) -> tuple[Lanes, States]:
+        """The quantities to differentiate, for lanes that have ended: the time of the event, or that at which a run leaves
+        the domain; and the state."""
+        time, state = lane_state.time, lane_state.state
+        if self.end(problem, time, state) is None:
+            return jnp.zeros_like(time), state
+        # First order: the event is located to 1e-10 of a step, and its time is not differentiated again.
+        later = delay(functools.partial(self.end, problem, time), state, problem.field(time, state))
+        return time_at_jump(problem, time, state, time + later), state
+
+    def share_of_end(self, lane_state: LaneState) -> tuple[Lanes, States]:
         """The factors of the measured quantities in what is differentiated."""
         if self.times is None or self.cotangents is None:
-            return jnp.ones_like(lane_state.time)
+            return jnp.ones_like(lane_state.time), jnp.zeros_like(lane_state.state)
         cell, has_left = self.times.cell_of(lane_state), (lane_state.status == LEFT_DOMAIN) & (lane_state.time > 0.0)
         at_end = jnp.where(lane_state.status == REACHED_END, self.cotangents.end_state[:, cell], 0.0)
         return jnp.where(has_left, self.cotangents.end_time[cell], 0.0), at_end
@@ -324,20 +317,14 @@ def solve_with_adjoint(
 
     def field_and_end(problem: AbstractProblem, states: States) -> PyTree:
         zero = jnp.zeros_like(states[0])
-        end = problem.event_function(states) if recorder.times is None else problem.domain_margin(zero, states)
-        return problem.field(zero, states), end, problem.jumps(zero, states)
+        return problem.field(zero, states), recorder.end(problem, zero, states), problem.jumps(zero, states)
 
     moving = moving_leaves(problem, probe, field_and_end)
-    numbers, static = eqx.partition(problem, moving)
-    numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*jnp.shape(leaf)[:-1], size)), numbers)
-    problem = eqx.combine(numbers, static)
-    # The chosen parameters now have one value per cell, so their rates must, too.
-    probe = jax.tree.map(
-        lambda rate, number: None if rate is None else jnp.broadcast_to(rate, jnp.shape(number)),
-        probe,
-        problem,
-        is_leaf=lambda rate: rate is None,
-    )
+    # One value per cell of the numbers that the tangent moves, and of their rates.
+    active = where_active(problem, probe)
+    active, probe = (jax.tree.map(lambda leaf: with_cells(leaf, size), tree) for tree in (active, probe))
+    problem = eqx.combine(active, problem)
+    numbers = eqx.filter(problem, moving)
     scheduler = LaneScheduler.of(
         VariationalProblem(problem, (probe,), ends_on_event), *options, one_kernel=True, n_blocks=2
     )
@@ -602,11 +589,7 @@ def ensemble_solve_with_tangents(
     if one_kernel and problem.fits_one_kernel and len(tangents) > MOST_FORWARD:
         ended, slopes = _slopes_by_adjoint(problem, tangents, not nonterminal, options)
     else:
-
-        def solve(group: Tangents) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-            return slopes_by_variations(problem, group, not nonterminal, options, one_kernel)
-
-        ended, slopes = in_groups(solve, tangents)
+        ended, slopes = slopes_by_variations(problem, tangents, not nonterminal, options, one_kernel)
     if not nonterminal:
         outcome = with_crossing_times(problem, ended)
     # An event at the start has a fixed time, whatever the tangent.
@@ -698,12 +681,3 @@ def shares_of(count: int) -> Float[np.ndarray, " count"]:
     that steps are as short as for one tangent.
     """
     return (0.5 + np.modf(0.618 * np.arange(count))[0]) / count
-
-
-def time_of_zero(problem: AbstractProblem, function: Callable[[States], PyTree], time: Lanes, state: States) -> Lanes:
-    """The time at which a function of the state vanishes, for a state at the zero (implicit function theorem).
-
-    First order, unlike `event_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
-    """
-    fall = stop_gradient(jax.jvp(function, (stop_gradient(state),), (problem.field(time, state),))[1])
-    return time_at_jump(problem, time, state, time - function(state) / jnp.where(fall == 0.0, 1.0, fall))

@@ -303,7 +303,7 @@ def _batched(
         # All members have the same runs, which may cost more than the derivatives with respect to every number.
         sizes = [leaves[k].size // (cells if flags[k] else 1) for k in solve.active]
         if sum(sizes) <= size * (TANGENT_COST if solve.parts is None else COTANGENT_COST):
-            return jax.vmap(functools.partial(solve.over_cells, request), axes)(*leaves), [0] * len(kinds)
+            return jax.vmap(functools.partial(solve.from_slopes, request), axes)(*leaves), [0] * len(kinds)
 
     def joined(leaf: Array, has_batch: bool, axis: int | None) -> Array:
         if axis is None:
@@ -370,29 +370,28 @@ class LinearSolve(AbstractSolve):
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
         return dataclasses.replace(self, of=self.of.for_parts(wanted)) if self.parts is None else self
 
-    def from_slopes(self, selection: tuple[int, ...], *arguments: Float[Array, "..."]) -> list[Array]:
-        """The selected outputs for a single cell, from the derivatives with respect to every number."""
-        leaves, last = arguments[: -self.linear], arguments[-self.linear :]
-        slopes = [flat(slope)[0] for slope in _value_and_tangents(self.of, self.active)(*leaves)[1]]
+    def from_slopes(self, request: Request, *arguments: Float[Array, "..."]) -> list[Array]:
+        """The outputs of a request, from the derivatives with respect to every number."""
 
-        def output(k: int) -> Array:
-            if self.parts is None:
-                pairs = [(slope[k], tangent) for slope, tangent in zip(slopes, last, strict=True)]
-            else:
-                pairs = [
-                    (jnp.moveaxis(slopes[k][part], range(cotangent.ndim), range(-cotangent.ndim, 0)), cotangent)
-                    for part, cotangent in zip(self.parts, last, strict=True)
-                ]
-            return sum((product(*pair) for pair in pairs), jnp.zeros(()))
+        def of_cell(*arguments: Float[Array, "..."]) -> list[Array]:
+            leaves, last = arguments[: -self.linear], arguments[-self.linear :]
+            slopes = [flat(slope)[0] for slope in _value_and_tangents(self.of, self.active)(*leaves)[1]]
 
-        return [output(k) for k in selection]
+            def output(k: int) -> Array:
+                if self.parts is None:
+                    pairs = [(slope[k], tangent) for slope, tangent in zip(slopes, last, strict=True)]
+                else:
+                    pairs = [
+                        (jnp.moveaxis(slopes[k][part], range(cotangent.ndim), range(-cotangent.ndim, 0)), cotangent)
+                        for part, cotangent in zip(self.parts, last, strict=True)
+                    ]
+                return sum((product(*pair) for pair in pairs), jnp.zeros(()))
 
-    def over_cells(self, request: Request, *arguments: Float[Array, "..."]) -> list[Array]:
-        """`from_slopes` for the cells of a request."""
+            return [output(k) for k in request.selection]
+
         if not any(request.batch_flags):
-            return [part[None] for part in self.from_slopes(request.selection, *arguments)]
-        axes = tuple(0 if flag else None for flag in request.batch_flags)
-        return jax.vmap(functools.partial(self.from_slopes, request.selection), axes)(*arguments)
+            return [part[None] for part in of_cell(*arguments)]
+        return jax.vmap(of_cell, tuple(0 if flag else None for flag in request.batch_flags))(*arguments)
 
 
 def product(slope: Float[Array, "..."], tangent: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -424,7 +423,7 @@ def _jvp(
     outputs = solve_cells.bind(*primals, request=request)
     if all(type(tangent) is ad.Zero for tangent in tangents[: -solve.linear]):
         return outputs, solve_cells.bind(*primals[: -solve.linear], *changes[-solve.linear :], request=request)
-    return outputs, jax.jvp(functools.partial(solve.over_cells, request), primals, changes)[1]
+    return outputs, jax.jvp(functools.partial(solve.from_slopes, request), primals, changes)[1]
 
 
 def _transposed(

@@ -2,8 +2,10 @@
 
 import abc
 import dataclasses
+import functools
+import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self, TypeAlias
+from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -40,20 +42,42 @@ class AbstractSampling(AbstractDifferentiableSolve):
     structure: Structure = eqx.field(static=True)
     rest: PyTree
 
+    #: Up to this many numbers, the derivatives with respect to all of them are integrated forward, beside the run; with
+    #: more, a gradient takes one backward pass.
+    most_forward: ClassVar[float] = math.inf
+
     @property
     def movable(self) -> int:
         return len(self.axes)
 
-    @abc.abstractmethod
     def built(self, modules: PyTree, tolerance: Array, cells: int | None) -> PyTree:
         """The problem of the modules, or what else is run; `cells` is `None` if the run is not in a block."""
+        return self.build(modules, cells)
 
     @abc.abstractmethod
     def sampled(self, built: PyTree, tangents: Tangents, options: Options, nested: bool) -> tuple[PyTree, list[PyTree]]:
         """The samples, and their derivative along each tangent, the cells first; `nested`: as for `value_and_tangents`."""
 
+    def evaluated(self, built: PyTree) -> list[tuple[Callable[..., PyTree], PyTree, States]]:
+        """What the backward pass differentiates: functions of what is run and of its states, and both arguments."""
+        return []
+
+    def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
+        if sum(leaves[k].size for k in active) <= self.most_forward:
+            return False
+        typed = [jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
+        # A loop without a fixed number of iterations has no backward pass.
+        try:
+            jax.eval_shape(functools.partial(_backward, self), *typed)
+        except ValueError:
+            return False
+        return True
+
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
+
+    def differentiable(self, primal: "SampledRun") -> "SampledRun":
+        return SampledRun(primal.states, primal.quadratures, primal.end_time)
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> PyTree:
         build, numbers, options, lanes = self.builder(cells, leaves)
@@ -76,10 +100,6 @@ class AbstractSampling(AbstractDifferentiableSolve):
         _, (slope,) = self.sampled(built, (direction,), options, False)
         return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
 
-    def unpacked(self, leaves: tuple[Array, ...]) -> tuple[PyTree, Options, PyTree]:
-        """The modules' numbers, as a tree, the options, and the rest of the modules."""
-        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest)
-
     def builder(
         self, cells: int, leaves: tuple[Array, ...]
     ) -> tuple[Callable[..., PyTree], tuple[Array, ...], Options, int | None]:
@@ -88,7 +108,8 @@ class AbstractSampling(AbstractDifferentiableSolve):
         **Returns:** a function (the modules' numbers, cells) -> problem; the modules' numbers, in a block scalars or with
         the cells last; the options; and the number of cells, `None` outside of blocks.
         """
-        numbers, (times, t1, settings, grid), others = self.unpacked(leaves)
+        parts = eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest)
+        numbers, (times, t1, settings, grid), others = parts
         numbers, structure = jax.tree.flatten(numbers)
         if self.in_blocks:
             numbers = [_cells_last(number, axes, cells) for number, axes in zip(numbers, self.axes, strict=True)]
@@ -101,6 +122,20 @@ class AbstractSampling(AbstractDifferentiableSolve):
             return self.built(modules, settings.tolerance, cells)
 
         return build, tuple(numbers), (times, t1, settings, grid), cells if self.in_blocks else None
+
+
+# Compiled, so that JAX traces it once for equal solves.
+@eqx.filter_jit
+def _backward(sampling: AbstractSampling, *leaves: Array) -> list[PyTree]:
+    """The backward passes of the functions of a single run, for their shapes. **Raises:** `ValueError` if there is none."""
+    build, numbers, *_ = sampling.builder(1, leaves)
+
+    def pulled_back(function: Callable[..., PyTree], run: PyTree, state: States) -> PyTree:
+        arrays, static = eqx.partition(run, eqx.is_inexact_array)
+        values, pull = jax.vjp(lambda arrays, state: function(eqx.combine(arrays, static), state), arrays, state)
+        return pull(jax.tree.map(jnp.ones_like, values))
+
+    return [pulled_back(*part) for part in sampling.evaluated(build(numbers, 1))]
 
 
 def _cells_last(number: Float[Array, "..."], axes: int, cells: int) -> Float[Array, "..."]:
@@ -139,11 +174,6 @@ def solve_for_samples(
 #: Build a problem from some modules (scene, launch, ...) and a number of cells, `None` for a single run.
 Build: TypeAlias = Callable[[PyTree, int | None], AbstractProblem]
 
-
-#: Up to this many numbers, the derivatives with respect to all of them are integrated forward, beside the run; with more,
-#: a gradient takes one backward pass. For 64 rides with 6 and 16 numbers, the gradient costs 8 and 17 values forward, and
-#: 5.5 and 4.8 backward (jax 0.10).
-MOST_FORWARD = 2
 
 #: In place of numbers that a `SampledRun` lacks.
 ABSENT: Any = None
@@ -290,34 +320,26 @@ class BlockSampling(AbstractSampling):
 
     core_only: bool = eqx.field(static=True, default=False)
 
+    #: For 64 rides with 6 and 16 numbers, the gradient costs 8 and 17 values forward, and 5.5 and 4.8 backward (jax 0.10).
+    most_forward = 2
+
     def built(self, modules: PyTree, tolerance: Array, cells: int | None) -> AbstractProblem:
-        problem = self.build(modules, cells)
+        problem = super().built(modules, tolerance, cells)
         return core_problem(problem) if self.core_only else problem
 
     def sampled(
         self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool
     ) -> tuple[SampledRun, list[SampledRun]]:
-        return _samples_and_slopes(VariationalProblem(built, tangents, False), options[:3], not nested)
+        variational, (times, t1, settings, _) = VariationalProblem(built, tangents, False), options
+        arguments = (variational, times, t1, jnp.asarray(built.start()[0].shape[1]), settings)
+        samples = solve_with_samples(*arguments, n_blocks=1 + len(tangents), one_kernel=not nested)
+        return _with_slopes(variational, *samples)
 
-    def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
-        if sum(leaves[k].size for k in active) <= MOST_FORWARD:
-            return False
-        numbers, _, others = self.unpacked(leaves)
-        problem = self.build(eqx.combine(numbers, others), None)
-        arrays, static = eqx.partition(problem, eqx.is_inexact_array)
+    def evaluated(self, built: AbstractProblem) -> list[tuple[Callable[..., PyTree], PyTree, States]]:
+        def rates(problem: AbstractProblem, state: States) -> States:
+            return problem.field(jnp.zeros_like(state[0]), state)
 
-        def summed(arrays: PyTree, state: States) -> Float[Array, ""]:
-            return jnp.sum(eqx.combine(arrays, static).field(jnp.zeros_like(state[0]), state))
-
-        # A loop without a fixed number of iterations has no backward pass.
-        try:
-            jax.eval_shape(jax.grad(summed, (0, 1)), arrays, problem.start()[0])
-        except ValueError:
-            return False
-        return True
-
-    def differentiable(self, primal: SampledRun) -> SampledRun:
-        return SampledRun(primal.states, primal.quadratures, primal.end_time)
+        return [(rates, built, built.start()[0])]
 
     def pull_back(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: SampledRun
@@ -340,17 +362,6 @@ class BlockSampling(AbstractSampling):
         fields = SampledRun._fields
         quadratures = any(fields[part % len(fields)] == "quadratures" for part in wanted)
         return self if quadratures else dataclasses.replace(self, core_only=True)
-
-
-@eqx.filter_jit
-def _samples_and_slopes(
-    variational: VariationalProblem, options: tuple[Array, Array, Settings], one_kernel: bool
-) -> tuple[SampledRun, list[SampledRun]]:
-    """The samples of the cells, and their derivative along each tangent."""
-    cells = jnp.asarray(variational.problem.start()[0].shape[1])
-    (times, t1, settings), n_blocks = options, 1 + len(variational.tangents)
-    arguments = (variational, times, t1, cells, settings)
-    return _with_slopes(variational, *solve_with_samples(*arguments, n_blocks=n_blocks, one_kernel=one_kernel))
 
 
 def _with_slopes(
@@ -384,9 +395,6 @@ class SingleSampling(AbstractSampling):
     """Samples by Diffrax, with any of its solvers."""
 
     in_blocks = False
-
-    def built(self, modules: PyTree, tolerance: Array, cells: int | None) -> AbstractProblem:
-        return self.build(modules, None)
 
     def sampled(
         self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import partial_eval
+from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.tracing import dependent_outputs
@@ -47,7 +48,7 @@ def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
     >>> print(tangent_scale(jnp.array([0.0, -3.0])))
     [1. 3.]
     """
-    return jax.lax.stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
+    return stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
 
 
 def tangents_of(
@@ -262,6 +263,13 @@ class VariationalProblem(AbstractDerivedProblem):
         return jnp.split(state, 1 + len(self.tangents)) if self.tangents else [state]
 
 
+def delay(function: Callable[[States], Lanes | None], state: States, rates: States) -> Lanes:
+    """A number that is zero, and whose variation is that of the time at which a function of the state vanishes
+    (implicit function theorem)."""
+    value, rate = jax.jvp(function, (state,), (rates,))
+    return -(value - stop_gradient(value)) / stop_gradient(jnp.where(rate == 0.0, jnp.inf, rate))
+
+
 def slopes_by_variations(
     problem: AbstractProblem, tangents: Tangents, ends_on_event: bool, options: RunOptions, one_kernel: bool
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
@@ -276,21 +284,25 @@ def slopes_by_variations(
 
     **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.
     """
-    variational = VariationalProblem(problem, tangents, ends_on_event)
-    # The variations take part in step-size control: the state alone may be at rest while its tangent is not, and the
-    # steps would become too long for the tangent.
-    blocks = 1 + len(tangents)
-    ended = LaneScheduler.of(variational, *options, n_blocks=blocks, one_kernel=one_kernel).solve()[0]
-    state, *variations = variational.parts(ended.state)
 
-    def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        return crossing_time(problem, ended.end_time, state)
+    def run(group: Tangents) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+        variational = VariationalProblem(problem, group, ends_on_event)
+        # The variations take part in step-size control: the state alone may be at rest while its tangent is not, and the
+        # steps would become too long for the tangent.
+        blocks = 1 + len(group)
+        ended = LaneScheduler.of(variational, *options, n_blocks=blocks, one_kernel=one_kernel).solve()[0]
+        state, *variations = variational.parts(ended.state)
 
-    slopes = [
-        eqx.filter_jvp(event_time, (problem, state), direction)[1]
-        for direction in zip(tangents, variations, strict=True)
-    ]
-    return ended._replace(state=state), slopes
+        def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+            return crossing_time(problem, ended.end_time, state)
+
+        slopes = [
+            eqx.filter_jvp(event_time, (problem, state), direction)[1]
+            for direction in zip(group, variations, strict=True)
+        ]
+        return ended._replace(state=state), slopes
+
+    return in_groups(run, tangents)
 
 
 def in_groups(run: Callable[..., tuple[PyTree, list[PyTree]]], tangents: Tangents) -> tuple[PyTree, list[PyTree]]:
@@ -330,47 +342,6 @@ def in_groups(run: Callable[..., tuple[PyTree, list[PyTree]]], tangents: Tangent
 # al., Meccanica 15 (1980) 9). Tangents and lengths are those of the state in units of the problem's magnitudes.
 
 
-class VariedProblem(AbstractDerivedProblem):
-    """A problem without its event, extended by a tangent of length 1, w' = J w - g w with g = (w . J w) / (w . w), and the
-    logarithm of its growth, the integral of g.
-
-    **Arguments:**
-
-    - `problem`: a problem.
-    - `states`: the problem's state, the tangent and the growth of every cell.
-    - `magnitudes`: magnitudes of the problem's own components.
-    """
-
-    problem: AbstractProblem
-    states: Float[Array, "twice_components_and_one cells"]
-    magnitudes: Float[Array, "components cells"]
-
-    ends_on_event = False
-
-    def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
-        unit_scales = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
-        return self.states, jnp.concatenate([self.magnitudes, unit_scales])
-
-    def field(self, time: Lanes, state: States) -> States:
-        y, w = self.inner(state), state[len(self.magnitudes) : -1]
-        rate, carried = jax.jvp(lambda point: self.problem.field(time, point), (y,), (w * self.magnitudes,))
-        carried = carried / self.magnitudes
-        growth = jnp.sum(w * carried, axis=0) / jnp.sum(w * w, axis=0)
-        return jnp.concatenate([rate, carried - growth * w, growth[None]])
-
-
-def probed(problem: AbstractProblem) -> VariedProblem:
-    """A run and a generic tangent, for derivatives that do not take part in step-size control. The generic tangent does
-    take part, so that the steps suit tangents even where the state is at rest.
-    """
-    start, magnitudes = problem.start()
-    direction = jnp.cos(1.0 + jnp.arange(len(start)))
-    direction = jnp.broadcast_to(direction.reshape(-1, *(1,) * (start.ndim - 1)), start.shape)
-    unit = direction / jnp.linalg.norm(direction, axis=0)
-    states = jnp.concatenate([start, unit, jnp.zeros((1, *start.shape[1:]))])
-    return VariedProblem(problem, states, magnitudes)
-
-
 class FramedProblem(AbstractDerivedProblem):
     """A problem without its event, extended by tangents.
 
@@ -383,14 +354,14 @@ class FramedProblem(AbstractDerivedProblem):
     """
 
     problem: AbstractProblem
-    states: Float[Array, "all cells"]
-    magnitudes: Float[Array, "components cells"]
+    states: Float[Array, "all *cells"]
+    magnitudes: Float[Array, "components *cells"]
     begin: Float[Array, ""]
 
     ends_on_event = False
 
-    def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
-        return self.states, jnp.tile(self.magnitudes, (len(self.states) // len(self.magnitudes), 1))
+    def start(self) -> tuple[Float[Array, "all *cells"], Float[Array, "all *cells"]]:
+        return self.states, jnp.concatenate([self.magnitudes] * (len(self.states) // len(self.magnitudes)))
 
     def field(self, time: Lanes, state: States) -> States:
         time, size = self.clock(time), len(self.magnitudes)
@@ -404,6 +375,17 @@ class FramedProblem(AbstractDerivedProblem):
     def jumps(self, time: Lanes, state: States) -> Jumps | None:
         jumps = super().jumps(time, state)
         return None if jumps is None else jumps._replace(times=jumps.times - self.begin)
+
+
+def probed(problem: AbstractProblem) -> FramedProblem:
+    """A run and a generic tangent, for derivatives that do not take part in step-size control. The generic tangent does
+    take part, so that the steps suit tangents even where the state is at rest.
+    """
+    start, magnitudes = problem.start()
+    direction = jnp.cos(1.0 + jnp.arange(len(start)))
+    direction = jnp.broadcast_to(direction.reshape(-1, *(1,) * (start.ndim - 1)), start.shape)
+    tangent = magnitudes * direction / jnp.linalg.norm(direction, axis=0)
+    return FramedProblem(problem, jnp.concatenate([start, tangent]), magnitudes, jnp.zeros(()))
 
 
 #: Tangents are orthonormalised before one grows or shrinks by more than e to this power: so much of their digits is lost.

@@ -172,6 +172,28 @@ class AbstractHoppingMode(AbstractBatchedMode):
 
     most_hops: ClassVar[int]
 
+    def all_hops(
+        self, first: PyTree, left: Lanes, kept: PyTree, keep: Callable[[PyTree, PyTree, PyTree, PyTree], PyTree]
+    ) -> tuple[PyTree, PyTree]:
+        """Follow the stretches from the first one on.
+
+        **Arguments:** `left`: as for `hop`; `kept`: what is kept of the stretches; `keep`: function of what is kept, of a
+            stretch at its begin and at its end, and of the next one, that returns what is kept then.
+
+        **Returns:** the stretch after the last one, and what is kept.
+        """
+
+        def hop(carry: tuple[PyTree, Array, PyTree]) -> tuple[PyTree, Array, PyTree]:
+            stretch, count, kept = carry
+            end, following = self.hop(stretch, left)
+            return following, count + 1, keep(kept, stretch, end, following)
+
+        def goes_on(carry: tuple[PyTree, Array, PyTree]) -> Bool[Array, ""]:
+            return jnp.any(carry[0].open) & (carry[1] < self.most_hops)
+
+        stretch, _, kept = jax.lax.while_loop(goes_on, hop, (first, jnp.zeros((), int), kept))
+        return stretch, kept
+
     @abc.abstractmethod
     def lost(self, state: States) -> PyTree:
         """The first stretch of motion after the mode, which starts from the states at its end."""

@@ -14,6 +14,7 @@ The rate of the event function at an event is the denominator of the derivative.
 tolerance (`GRAZING`), the event is grazing and the derivative has no correct digits; a counter counts such events.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, Generic, NamedTuple
@@ -26,7 +27,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..derivatives import VariationalProblem, in_groups, tangents_of
-from ..derivatives.variation import where_active
+from ..derivatives.variation import delay, where_active
 from ..integration import AbstractPassive, AbstractProblem, ExtendedProblem, Lanes, Settings, States
 from ..integration.problem import CROSSED, REACHED_END
 from ..integration.scheduler import Numbers
@@ -116,63 +117,36 @@ class VariationalMode(AbstractBatchedMode):
             transition = transition._replace(state=state, counts=counts, record=None, log_rates=None)
             return transition, path, jax.tree.map(lambda value: jnp.zeros((0, *value.shape)), path)
         numbers, build = self.active_numbers()
-        zero_rates = [jnp.zeros_like(number) for number in numbers]
-        rates = self.mode.problem(primal).field(duration, primal)
-        # The last tangent is an error of the state.
-        directions = self.directions([part[:-1] for part in variations])
-        directions.append((self._error(primal, duration, rates), *zero_rates))
-        delays, log_rates = self._delays(primal, duration, [*directions, (rates, *zero_rates)])
+        zero, rates = jnp.zeros_like(duration), self.mode.problem(primal).field(duration, primal)
 
-        def reset(primal: States, left: Lanes, *numbers: Array) -> tuple[PyTree, Transition]:
-            transition, path = reset_with_path(build(*numbers), primal, left)
-            log_rates = jnp.zeros_like(left) if transition.log_rates is None else transition.log_rates
-            changing = (transition.state, transition.elapsed, log_rates, path)
+        def reset(primal: States, start_time: Lanes, *numbers: Array) -> tuple[PyTree, Transition]:
+            mode = build(*numbers)
+            problem = mode.problem(primal)
+            state, later = moved_with_event(problem, primal, duration)
+            start_time = start_time + later
+            rate = jax.jvp(functools.partial(margin, problem, duration), (state,), (problem.field(duration, state),))[1]
+            # A mode that ended when it began has not reached its event.
+            log_rate = jnp.log(jnp.abs(jnp.where((duration > 0.0) & (rate != 0.0), rate, 1.0)))
+            transition, path = reset_with_path(mode, state, left - start_time)
+            log_rate = log_rate if transition.log_rates is None else log_rate + transition.log_rates
+            changing = (transition.state, start_time + transition.elapsed, log_rate, path)
             return changing, transition._replace(record=None, log_rates=None)
 
-        begins = [*[variation[None, -1] for variation in variations], jnp.zeros_like(duration)[None]]
-        start_delays = jnp.concatenate(begins) + delays
-        after_event = [
-            (direction[0] + shift * rates, -start_delay, *direction[1:])
-            for direction, shift, start_delay in zip(directions, delays, start_delays, strict=True)
-        ]
-        values, changes_after, transition = along(reset, (primal, left, *numbers), after_event, has_aux=True)
-        states, elapsed, reset_log_rates, changes = changes_after
-        new_variations = jnp.concatenate([states, (start_delays + elapsed)[:, None]], axis=1)[:count]
-        log_rates = jnp.max(jnp.abs(log_rates + reset_log_rates), axis=0)
+        directions = self.directions([part[:-1] for part in variations], [part[-1] for part in variations])
+        # The last tangent is an error of the state.
+        directions.append((self._error(primal, duration, rates), zero, *map(jnp.zeros_like, numbers)))
+        values, changes, transition = along(reset, (primal, zero, *numbers), directions, has_aux=True)
+        states, start_times, log_rates, changes_of_path = changes
+        new_variations = jnp.concatenate([states, start_times[:, None]], axis=1)[:count]
+        log_rates = jnp.max(jnp.abs(log_rates), axis=0)
         finite = jnp.isfinite(new_variations).all(axis=(0, 1)) & jnp.isfinite(log_rates)
         grazes = ~finite | (self.tolerance * log_rates > GRAZING)
         # The run itself is valid, so variations without correct digits must not end the run.
         new_variations = jnp.where(finite, new_variations, 0.0)
-        extended_state = jnp.concatenate([transition.state, jnp.zeros_like(duration)[None], *new_variations])
+        extended_state = jnp.concatenate([transition.state, zero[None], *new_variations])
         counts = jnp.concatenate([transition.counts, grazes.astype(int)[None]])
         transition = transition._replace(state=extended_state, counts=counts)
-        return transition, values[-1], jax.tree.map(lambda change: change[:count], changes)
-
-    def _delays(
-        self, primal: States, duration: Lanes, directions: list[tuple[Array, ...]]
-    ) -> tuple[Float[Array, "tangents cells"], Float[Array, "tangents cells"]]:
-        """The variations of the time at which the mode ends, and of the logarithm of the rate of its margin there.
-
-        **Arguments:** `directions`: the tangents, followed by the tangent along time, which has no variations of its own.
-        """
-        numbers, build = self.active_numbers()
-
-        def margin_and_rate(primal: States, *numbers: Array) -> tuple[Array, Array]:
-            problem = build(*numbers).problem(primal)
-            rates = problem.field(duration, primal)
-
-            def margin(primal: States) -> Lanes:
-                value = problem.domain_margin(duration, primal)
-                return jnp.ones_like(duration) if value is None else value
-
-            return jax.jvp(margin, (primal,), (rates,))
-
-        (_, rate), (domain_margins, changes) = along(margin_and_rate, (primal, *numbers), directions)
-        # A mode that ended when it began has not reached its event.
-        has_delay = (duration > 0.0) & (rate != 0.0)
-        safe = jnp.where(has_delay, rate, 1.0)
-        delays = jnp.where(has_delay, -domain_margins[:-1] / safe, 0.0)
-        return delays, jnp.where(has_delay, (changes[:-1] + changes[-1] * delays) / safe, 0.0)
+        return transition, values[-1], jax.tree.map(lambda change: change[:count], changes_of_path)
 
     def output_rows(
         self, state: Float[Array, "components times"]
@@ -238,11 +212,19 @@ class VariationalMode(AbstractBatchedMode):
         return [(*arrays, *jax.tree.leaves(tangent)) for *arrays, tangent in zip(*moves, self.tangents, strict=True)]
 
 
-def delay(function: Callable[[States], Lanes | None], state: States, rates: States) -> Lanes:
-    """A number that is zero, and whose variation is that of the time at which a function of the state vanishes
-    (implicit function theorem)."""
-    value, rate = jax.jvp(function, (state,), (rates,))
-    return -(value - stop_gradient(value)) / stop_gradient(jnp.where(rate == 0.0, jnp.inf, rate))
+def margin(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
+    """The domain margin of a problem; 1 if there is none."""
+    value = problem.domain_margin(time, state)
+    return jnp.ones_like(time) if value is None else value
+
+
+def moved_with_event(problem: AbstractProblem, state: States, duration: Lanes) -> tuple[States, Lanes]:
+    """The state at the end of a mode, and zero, with the variations of the state and of the time at which the margin
+    vanishes: the first half of the saltation matrix."""
+    rates = stop_gradient(problem.field(duration, state))
+    later = delay(functools.partial(margin, problem, duration), state, rates)
+    later = jnp.where(duration > 0.0, later, 0.0)
+    return state + rates * later, later
 
 
 def along(

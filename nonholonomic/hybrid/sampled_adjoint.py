@@ -40,7 +40,7 @@ from .ensemble import (
     program_groups,
     time_left,
 )
-from .saltation import VariationalMode, along, delay, variational_modes, variational_start
+from .saltation import VariationalMode, along, moved_with_event, variational_modes, variational_start
 from .samples import Built, Recorded, output_rows, reset_with_rows, sampled_rounds, sampled_with_tangents, weighted
 
 #: From some modules (scene, launch, ...), the tolerance and a number of cells to the modes, the index of the first mode
@@ -48,11 +48,9 @@ from .samples import Built, Recorded, output_rows, reset_with_rows, sampled_roun
 Build = Callable[[PyTree, Array, int], Built]
 
 
-#: Up to this many numbers, the derivatives are integrated forward; with more, a gradient takes one backward pass. For 64
-#: bouncing balls, the gradient by 3 and 5 numbers costs 6 and 7 values forward, and 6 backward; for 64 hopping tops, that
-#: by 10 numbers costs 24 forward and 12 backward (jax 0.10). A single run waits for its program, not for its steps, and
-#: the backward pass takes up to twice as long to compile.
-MOST_FORWARD, MOST_FORWARD_ALONE = 6, 32
+#: Up to this many numbers, those of a single run are always integrated forward: the run waits for its program, not for its
+#: steps, and the backward pass takes up to twice as long to compile.
+MOST_FORWARD_ALONE = 32
 
 
 def hybrid_samples(
@@ -119,6 +117,10 @@ class HybridSampling(AbstractSampling):
 
     counters: int = eqx.field(static=True)
 
+    #: For 64 bouncing balls, the gradient by 3 and 5 numbers costs 6 and 7 values forward, and 6 backward; for 64 hopping
+    #: tops, that by 10 numbers costs 24 forward and 12 backward (jax 0.10).
+    most_forward = 6
+
     def built(self, modules: PyTree, tolerance: Array, cells: int | None) -> Built:
         return self.build(modules, tolerance, cells)
 
@@ -130,18 +132,13 @@ class HybridSampling(AbstractSampling):
         tangents, settings = tuple((tangent[0], tangent[2]) for tangent in tangents), options[2]
         return sampled_with_tangents(built, tangents, options[:2], built[2].shape[1], settings, self.counters)
 
-    def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
-        if len(active) <= MOST_FORWARD:
-            return False
-        typed = [jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
-        try:
-            jax.eval_shape(functools.partial(_backward, self), *typed)
-        except ValueError:
-            return False
-        return True
+    def evaluated(self, built: Built) -> list[tuple[Callable[..., PyTree], PyTree, States]]:
+        def values(mode: AbstractBatchedMode, state: States) -> PyTree:
+            shown = over_cells(lambda mode, states: mode.shown(states), mode)(state[:, None])
+            return mode.problem(state).field(jnp.zeros_like(state[0]), state), shown
 
-    def differentiable(self, primal: SampledRun) -> SampledRun:
-        return SampledRun(primal.states, None, primal.end_time)
+        modes, _, state = built
+        return [(values, modes[group[0]], state) for group in program_groups(modes)]
 
     def pull_back(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: SampledRun
@@ -167,30 +164,6 @@ def _product(slope: SampledRun, cotangents: SampledRun) -> Lanes:
     pairs = ((slope.states, cotangents.states), (slope.end_time, cotangents.end_time))
     terms = [weighted(one, other).reshape(len(one), -1) for one, other in pairs if other is not None]
     return sum((jnp.sum(term, axis=1) for term in terms), jnp.zeros(len(slope.end_time)))
-
-
-# Compiled, so that JAX traces it once for equal solves.
-@eqx.filter_jit
-def _backward(sampling: HybridSampling, *leaves: Array) -> list[PyTree]:
-    """The backward passes of the fields and of the output rows of a single run, for their shapes.
-
-    **Raises:** `ValueError` if one of them has a loop without a fixed number of iterations.
-    """
-    build, numbers, *_ = sampling.builder(1, leaves)
-    modes, _, state = build(numbers, 1)
-
-    def of_mode(mode: AbstractBatchedMode) -> PyTree:
-        arrays, static = eqx.partition(mode, eqx.is_inexact_array)
-
-        def values(arrays: PyTree, state: States) -> PyTree:
-            mode = eqx.combine(arrays, static)
-            shown = over_cells(lambda mode, states: mode.shown(states), mode)(state[:, None])
-            return mode.problem(state).field(jnp.zeros_like(state[0]), state), shown
-
-        results, pull = jax.vjp(values, arrays, state)
-        return pull(jax.tree.map(jnp.ones_like, results))
-
-    return [of_mode(modes[group[0]]) for group in program_groups(modes)]
 
 
 # The backward pass.
@@ -355,15 +328,13 @@ class Round(NamedTuple):
         def share(primal: States, start_time: Lanes, *numbers: Array) -> Array:
             """The share of the later run in the sum; the reset moves with the event (`saltation.py`)."""
             mode = build(*numbers)
-            problem = mode.problem(primal)
-            rates = stop_gradient(problem.field(duration, primal))
-            later = delay(lambda point: problem.domain_margin(duration, point), primal, rates)
-            later = jnp.where(duration > 0.0, later, 0.0)
-            state, left_then = primal + rates * later, left - start_time - later
+            state, later = moved_with_event(mode.problem(primal), primal, duration)
+            start_time = start_time + later
+            left_then = left - start_time
             transition, rows = reset_with_rows(
                 mode, state, left_then, part.times - part.t1 + left_then, part.t1, weights
             )
-            by_end = weighted(by_time, start_time + later + transition.elapsed)
+            by_end = weighted(by_time, start_time + transition.elapsed)
             total = by_end + jnp.sum(weighted(costate.state, transition.state), axis=0)
             return total if rows is None else total + rows
 

@@ -84,16 +84,6 @@ def _rows_of_path(
     return mode.between(motions, jnp.where(jnp.isfinite(start_time), times - start_time, 0.0))
 
 
-class Hops(NamedTuple):
-    """A succession of stretches: the current one, the number of stretches so far, the output rows or their weighted sum,
-    and the index of the next sample in every cell."""
-
-    stretch: PyTree
-    count: Int[Array, ""]
-    rows: Float[Array, "*shown_times cells"]
-    sample: Int[Array, " cells"]
-
-
 def _hops_with_rows(
     mode: AbstractHoppingMode,
     state: States,
@@ -111,39 +101,35 @@ def _hops_with_rows(
         factors = weights.at[:, row, cells].get(mode="fill", fill_value=0.0)
         return rows + jnp.sum(weighted(factors, values), axis=0)
 
-    def hop(hops: Hops) -> Hops:
-        stretch, count, rows, sample = hops
-        end, following = mode.hop(stretch, left)
+    def next_time(sample: Int[Array, " cells"]) -> Lanes:
+        time = times[jnp.minimum(sample, len(times) - 1), cells]
+        return jnp.where(sample < len(times), time, jnp.inf)
+
+    def with_samples(
+        kept: tuple[Array, Int[Array, " cells"]], stretch: PyTree, end: PyTree, following: PyTree
+    ) -> tuple[Array, Int[Array, " cells"]]:
+        """The output rows or their sum, and the index of the next sample in every cell, after a stretch."""
         motion = mode.motion_in(stretch)
         # Rounding may put the end of the last stretch before a sample at the end of the transition.
         reach = end.elapsed + jnp.where(following.open, 0.0, slack)
 
-        def next_time(sample: Int[Array, " cells"]) -> Lanes:
-            time = times[jnp.minimum(sample, len(times) - 1), cells]
-            return jnp.where(sample < len(times), time, jnp.inf)
-
         def is_inside(sample: Int[Array, " cells"]) -> Bool[Array, " cells"]:
             return stretch.open & (next_time(sample) <= reach)
 
-        def filled(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-            rows, sample = carry
+        def filled(kept: tuple[Array, Array]) -> tuple[Array, Array]:
+            rows, sample = kept
             inside = is_inside(sample)
             passed = jnp.where(inside, next_time(sample) - stretch.elapsed, 0.0)
             row = jnp.where(inside, sample, len(times))
             return with_values(rows, row, mode.between(motion, passed)), sample + inside
 
-        rows, sample = jax.lax.while_loop(lambda carry: jnp.any(is_inside(carry[1])), filled, (rows, sample))
-        return Hops(following, count + 1, rows, sample)
-
-    def goes_on(hops: Hops) -> Bool[Array, ""]:
-        return jnp.any(hops.stretch.open) & (hops.count < mode.most_hops)
+        return jax.lax.while_loop(lambda kept: jnp.any(is_inside(kept[1])), filled, kept)
 
     start = mode.lost(state)
     row = jax.eval_shape(mode.between, mode.motion_in(start), start.elapsed)
     rows = jnp.zeros((len(row), *times.shape) if weights is None else left.shape)
-    hops = Hops(start, jnp.zeros((), int), rows, jnp.sum(times <= 0.0, axis=0))
-    hops = jax.lax.while_loop(goes_on, hop, hops)
-    return mode.closed(hops.stretch), hops.rows
+    stretch, (rows, _) = mode.all_hops(start, left, (rows, jnp.sum(times <= 0.0, axis=0)), with_samples)
+    return mode.closed(stretch), rows
 
 
 # The rounds of hybrid runs with samples at given times, and the output rows of the samples.

@@ -19,9 +19,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..compilation.tracing import named_errors, with_own_numbers
 from ..derivatives import differentiable_solve, tangent_scale, tangents_by
+from ..derivatives.variation import delay
 from ..geometry.vector import nearest_turn
 from ..hybrid import solve_hybrid
-from ..hybrid.saltation import VariationalMode, along, delay, variational_modes, variational_start
+from ..hybrid.saltation import VariationalMode, along, variational_modes, variational_start
 from ..integration import Settings
 from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESOLVED
 from ..parameters import Parameters, as_one

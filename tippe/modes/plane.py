@@ -421,23 +421,28 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 
         Counts the flights.
         """
-
-        def hop(carry: tuple[Air, Array, TransitionPath | None]) -> tuple[Air, Array, TransitionPath | None]:
-            air, count, record = carry
-            air_after, air_landed = self.hop(air, left)
-            return air_landed, count + 1, _with_flight(self.scene.body, record, air, air_after)
-
         start, record = self.lost(state), None
         if self.with_quadratures:
             flight = TransitionPath(start.elapsed, (start.free, start.quadratures), start.flights)
             record = jax.tree.map(lambda leaf: jnp.zeros((MOST_BOUNCES, *leaf.shape), leaf.dtype), flight)
             record = record._replace(ends=jnp.inf + record.ends)
-        air, _, record = jax.lax.while_loop(
-            lambda carry: jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES),
-            hop,
-            (start, jnp.zeros((), int), record),
-        )
+        air, record = self.all_hops(start, left, record, self._with_flight)
         return self.closed(air)._replace(record=record)
+
+    def _with_flight(
+        self, record: TransitionPath | None, air_before: Air, air_after: Air, _: Air
+    ) -> TransitionPath | None:
+        """The record of a single run, if there is one, with the flight between two states added, if there was one."""
+        if record is None:
+            return None
+        place, has_flown = air_before.flights[0], air_after.flights > air_before.flights
+        angle = cone(self.scene.body, air_before.free).rate * (air_after.elapsed - air_before.elapsed)
+        new = TransitionPath(
+            jnp.where(has_flown, air_after.elapsed, jnp.inf),
+            (air_before.free, air_before.quadratures),
+            1 + (angle / SHOWN).astype(int),
+        )
+        return jax.tree.map(lambda leaves, leaf: leaves.at[place].set(leaf), record, new)
 
     def lost(self, state: States) -> Air:
         """The top at the end of sliding: its contact is lost or jams, or the other sphere is at the plane."""
@@ -563,17 +568,3 @@ def shown(body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."]) -> Floa
     distance = (gap(main, free), gap_rate(body, main, free))
     rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *quadratures[2:], *distance)
     return jnp.stack(jnp.broadcast_arrays(*rows))
-
-
-def _with_flight(body: Top, record: TransitionPath | None, air_before: Air, air_after: Air) -> TransitionPath | None:
-    """The record of a single run, if there is one, with the flight between two states added, if there was one."""
-    if record is None:
-        return None
-    place, has_flown = air_before.flights[0], air_after.flights > air_before.flights
-    angle = cone(body, air_before.free).rate * (air_after.elapsed - air_before.elapsed)
-    new = TransitionPath(
-        jnp.where(has_flown, air_after.elapsed, jnp.inf),
-        (air_before.free, air_before.quadratures),
-        1 + (angle / SHOWN).astype(int),
-    )
-    return jax.tree.map(lambda leaves, leaf: leaves.at[place].set(leaf), record, new)

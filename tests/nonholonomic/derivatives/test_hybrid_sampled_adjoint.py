@@ -99,7 +99,7 @@ def exact_height(restitution, gravity, height, time):
 
 def test_a_single_backward_pass_gives_the_derivatives_of_the_closed_form(monkeypatch):
     """Only two of the four rounds are kept, so that the others are computed again."""
-    monkeypatch.setattr(samples, "MOST_FORWARD", 0)
+    monkeypatch.setattr(samples.HybridSampling, "most_forward", 0)
     monkeypatch.setattr(samples, "MOST_FORWARD_ALONE", 0)
     monkeypatch.setattr(adjoint, "SLOTS", 2)
 
@@ -117,9 +117,9 @@ def test_a_single_backward_pass_gives_the_derivatives_of_the_closed_form(monkeyp
 @pytest.mark.slow
 def test_the_backward_pass_gives_the_derivatives_of_the_forward_mode(monkeypatch):
     """Through changes of mode and bounces, and at the ends of runs that end early."""
-    monkeypatch.setattr(samples, "MOST_FORWARD", 0)
+    monkeypatch.setattr(samples.HybridSampling, "most_forward", 0)
     backward = gradients(loss, POINTS)
-    monkeypatch.setattr(samples, "MOST_FORWARD", 5)
+    monkeypatch.setattr(samples.HybridSampling, "most_forward", 5)
     assert_close(backward, gradients(loss, POINTS), rtol=1e-9, atol=1e-9)
     run = jax.jit(jax.vmap(lambda point: loss(point, 1e-13)))
     for point, slopes in zip(POINTS, backward, strict=True):
@@ -133,7 +133,7 @@ def test_the_backward_pass_gives_the_derivatives_of_the_forward_mode(monkeypatch
 @pytest.mark.slow
 def test_derivatives_after_a_grazing_event_are_not_numbers(monkeypatch):
     """Balls that reach the ceiling at 10 % to 1e-9 of the energy of their start, and end there with that speed."""
-    monkeypatch.setattr(samples, "MOST_FORWARD", 0)
+    monkeypatch.setattr(samples.HybridSampling, "most_forward", 0)
     energies = np.array([1e-1, 1e-3, 1e-5, 1e-7])
     speeds = np.sqrt(2.0 * 9.81 * CEILING * (1.0 + energies))
     points = jnp.stack([jnp.array([0.5, 9.81, 0.0, 0.0, speed]) for speed in speeds])
