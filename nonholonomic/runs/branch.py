@@ -407,7 +407,7 @@ def continuation_of(
         raise ValueError(OF_A_FAMILY)
     require(until, "until")
     search, model = orbit.search, orbit.search.model(orbit.leaves)
-    known = [full for full in (*model.known, *model.known_of_event) if not full.startswith(("start", "launch"))]
+    known = [full for full in model.known if not full.startswith(("start", "launch"))]
     matches = meant(name, known)
     merged = {of_all_modes(match) for match in matches}
     # A number of all modes need not be named as such.

@@ -17,7 +17,7 @@ from ..hybrid import AbstractBatchedMode, HybridOutcome
 from ..hybrid.ensemble import OnlyMode
 from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
-from ..parameters import full_name, numbers, with_numbers
+from ..parameters import full_name, numbers, numbers_of, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..text import likely_fix, shown
 from ..validation import ArrayOrList, require_all
@@ -60,9 +60,6 @@ class AbstractModel(eqx.Module):
 
     #: The full names of the parameters; those of the start begin with "start" or "launch".
     known: ClassVar[list[str]]
-
-    #: Those of the event, if they are not among these.
-    known_of_event: ClassVar[list[str]] = []
 
     @abc.abstractmethod
     def full_name(self, argument: str, name: str) -> str:
@@ -176,12 +173,16 @@ class AbstractModel(eqx.Module):
     #: Whether the motion or the event depends on time.
     depends_on_time: ClassVar[bool]
 
-    #: The names of the components of the reduced state, and the numbers of the start that are these, in the order of leaves.
-    reduced_names: ClassVar[tuple[str, ...]]
+    #: The numbers of the start that are components of the reduced state, in the order of leaves.
     reduced_start: ClassVar[list[Array]]
 
     #: The names of those that are angles, to which whole turns may be added.
     angles: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def reduced_names(self) -> tuple[str, ...]:
+        """The names of the components of the reduced state; by default those of the state of your own system."""
+        return self.names
 
     @abc.abstractmethod
     def reduced(self, rows: Float[Array, "rows cells"], mode: Int[Array, " cells"]) -> Float[Array, "components cells"]:
@@ -238,17 +239,22 @@ class AbstractSceneModel(AbstractModel):
     angles = ("azimuth", "eta", "mu", "heading")
     at_rest = "; a steady motion is no orbit, and tippe.steady has those of tops"
 
+    #: The full names of numbers of these trees that cannot be varied.
+    fixed: ClassVar[tuple[str, ...]] = ()
+
     @property
-    def known_of_event(self) -> list[str]:
-        """The full names of the parameters of the event."""
-        return [] if self.event is None else self.event.parameters.known
+    def known(self) -> list[str]:
+        """The full names of the numbers that can be varied: single ones, including omitted ones, which are 0."""
+        values = numbers_of(self.roots)
+        names = [name for name, value in values.items() if np.ndim(value) == 0 and name not in self.fixed]
+        return names if self.event is None else [*names, *self.event.parameters.known]
 
     @property
     def depends_on_time(self) -> bool:
         return self.event is not None and self.event.depends_on_time
 
     def full_name(self, argument: str, name: str) -> str:
-        return full_name(argument, name, [*self.known, *self.known_of_event])
+        return full_name(argument, name, self.known)
 
     def value(self, name: str) -> Array:
         if name.startswith("event.") and self.event is not None:

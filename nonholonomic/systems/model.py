@@ -155,10 +155,6 @@ class OwnModel(AbstractModel):
         return jnp.asarray(self.components_of(self.on_constraints(rows)))
 
     @property
-    def reduced_names(self) -> tuple[str, ...]:
-        return self.names
-
-    @property
     def reduced_start(self) -> list[Array]:
         pairs = zip(self.parameters.names, self.parameters.values, strict=True)
         return [value for name, value in pairs if name.startswith("start") and value is not None]

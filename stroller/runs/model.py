@@ -21,7 +21,7 @@ from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractProblem, Outcome
 from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_run
-from nonholonomic.parameters import description, full_axes, numbers, numbers_of
+from nonholonomic.parameters import description, full_axes, numbers
 from nonholonomic.runs.event import EventFunction, with_clock, with_event
 from nonholonomic.runs.identify import Data, Prior, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, run_of, statuses
@@ -121,12 +121,8 @@ class RideModel(AbstractSceneModel):
         return {"scene": self.scene, "launch": self.launch} | module
 
     @property
-    def known(self) -> list[str]:
-        """The full names of the parameters that can be varied: single numbers, including omitted ones, which are 0."""
-        values, level = numbers_of(self.roots), isinstance(self.scene.surface, Plane)
-        return [
-            name for name, value in values.items() if np.ndim(value) == 0 and (level or name != "scene.body.centre")
-        ]
+    def fixed(self) -> tuple[str, ...]:
+        return () if isinstance(self.scene.surface, Plane) else ("scene.body.centre",)
 
     def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
         """The name of an axis is the last part of its full name, or the last two parts if one is ambiguous. Numbers of a

@@ -207,13 +207,13 @@ class TopModel(AbstractSceneModel):
             return super().full_name(argument, name)
         values = numbers_of(self.roots)
         present = [name for name, value in values.items() if value is not None and np.ndim(value) == 0]
-        return full_name(argument, name, [*present, *self.known_of_event])
+        return full_name(argument, name, [*present, *(name for name in self.known if name.startswith("event."))])
 
     @property
-    def known(self) -> list[str]:
-        """The full names of the parameters that can be varied: single numbers, including omitted ones, which are 0."""
-        present = numbers("launch", self.launch)
-        return [*variable_numbers(self.scene), *(name for name in NUMBERS_OF_A_LAUNCH if name in present)]
+    def fixed(self) -> tuple[str, ...]:
+        # A vector that a launch leaves out is no number.
+        vectors = [f"launch.{name}" for name in ("place", *SEVERAL)]
+        return (*vectors, *(() if self.scene.contact == "hybrid" else ("scene.restitution",)))
 
     def label(self, names: list[str], taken: Collection[str] | None = None) -> dict[str, tuple[str, str, str]]:
         """The name of an axis is the last part of the full name, or the full name if another of the `names` has the same last
