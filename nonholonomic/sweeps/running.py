@@ -551,13 +551,12 @@ def _starting_in(place: int, threads: int) -> Iterator[None]:
         settings |= {"JAX_COMPILATION_CACHE_DIR": str(folder), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
         settings |= {"JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
     with contextlib.ExitStack() as stack:
-        old_values = {name: os.environ.get(name) for name in settings}
-        os.environ.update(settings)
-        for name, value in old_values.items():
-            if value is None:
-                stack.callback(os.environ.pop, name)
+        for name in settings:
+            if name in os.environ:
+                stack.callback(os.environ.update, {name: os.environ[name]})
             else:
-                stack.callback(os.environ.update, {name: value})
+                stack.callback(os.environ.pop, name)
+        os.environ.update(settings)
         if hasattr(os, "sched_setaffinity"):
             allowed = sorted(os.sched_getaffinity(0))
             os.sched_setaffinity(0, {allowed[(place * threads + k) % len(allowed)] for k in range(threads)})

@@ -230,9 +230,8 @@ class Table(eqx.Module):
             arrays[name] = np.asarray(values)
             if arrays[name].dtype.kind == "U":
                 # Words that are not listed follow those that are.
-                listed = self.words.get(name, ())
-                used = dict.fromkeys(arrays[name].ravel().tolist())
-                words[name] = (*listed, *(word for word in used if word not in (*listed, UNREACHED)))
+                used = dict.fromkeys([*self.words.get(name, ()), *arrays[name].ravel().tolist()])
+                words[name] = tuple(word for word in used if word != UNREACHED)
                 codes = {word: code for code, word in enumerate(words[name])} | {UNREACHED: PENDING}
                 arrays[name] = np.vectorize(codes.__getitem__, otypes=[np.int8])(arrays[name])
         kinds = {name: values.dtype for name, values in arrays.items()}
