@@ -184,7 +184,7 @@ class RideModel(AbstractSceneModel):
         if cells is not None:
             parts = [jnp.broadcast_to(part.reshape(len(part), -1), (len(part), cells)) for part in parts]
         press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
-        # A run without an event, or of which quantities are read, goes on where the ground would have to pull.
+        # Loss of contact is the event of tables without another one. Single rides and samples do not look for it.
         watched = cells is not None and names == () and self.event is None and not isinstance(scene.surface, Plane)
         guarded = cells is not None and scene.heading == "projected"
         ride = RideProblem(scene.dynamics, controls, parts[0], parts[1], press, watched, guarded, times)
