@@ -124,7 +124,7 @@ class VariationalMode(AbstractBatchedMode):
             problem = mode.problem(primal)
             state, later = moved_with_event(problem, primal, duration)
             start_time = start_time + later
-            rate = jax.jvp(functools.partial(margin, problem, duration), (state,), (problem.field(duration, state),))[1]
+            rate = jax.jvp(functools.partial(problem.margin_or_one, duration), (state,), (problem.field(duration, state),))[1]
             # A mode that ended when it began has not reached its event.
             log_rate = jnp.log(jnp.abs(jnp.where((duration > 0.0) & (rate != 0.0), rate, 1.0)))
             transition, path = reset_with_path(mode, state, left - start_time)
@@ -212,17 +212,11 @@ class VariationalMode(AbstractBatchedMode):
         return [(*arrays, *jax.tree.leaves(tangent)) for *arrays, tangent in zip(*moves, self.tangents, strict=True)]
 
 
-def margin(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
-    """The domain margin of a problem; 1 if there is none."""
-    value = problem.domain_margin(time, state)
-    return jnp.ones_like(time) if value is None else value
-
-
 def moved_with_event(problem: AbstractProblem, state: States, duration: Lanes) -> tuple[States, Lanes]:
     """The state at the end of a mode, and zero, with the variations of the state and of the time at which the margin
     vanishes: the first half of the saltation matrix."""
     rates = stop_gradient(problem.field(duration, state))
-    later = delay(functools.partial(margin, problem, duration), state, rates)
+    later = delay(functools.partial(problem.margin_or_one, duration), state, rates)
     later = jnp.where(duration > 0.0, later, 0.0)
     return state + rates * later, later
 

@@ -255,13 +255,6 @@ def saved(solution: diffrax.Solution) -> tuple[PyTree, PyTree]:
     return solution.ts, solution.ys
 
 
-def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, ""]:
-    """The domain margin of a problem that has one."""
-    domain_margin = problem.domain_margin(time, state)
-    assert domain_margin is not None
-    return domain_margin
-
-
 @eqx.filter_jit
 def _start(
     problem: AbstractProblem, time: Float[Array, ""]
@@ -323,7 +316,7 @@ def _piece(
     is_watched: bool,
 ) -> tuple[diffrax.Solution, Float[Array, "steps 2"] | None]:
     """Integrate as many steps as the settings allow; also bracket the first zero of the domain margin in each step."""
-    margin = eqx.filter_closure_convert(functools.partial(_guard, problem), t0, state) if is_watched else None
+    margin = eqx.filter_closure_convert(problem.margin_or_one, t0, state) if is_watched else None
     solver = settings.for_single_runs if dense or is_watched else settings.for_steps_alone
     event = None if margin is None else diffrax.Event(lambda t, y, args, **_: margin(t, y) < 0.0)
     options = {"saveat": diffrax.SaveAt(t0=True, steps=True, dense=dense or is_watched), "event": event}
@@ -347,7 +340,7 @@ def _first_losses(
         return jax.vmap(solution.evaluate)(time + place * length).T
 
     end = states(1.0)
-    margins = jax.vmap(functools.partial(_guard, problem), (0, 1))(time + length, end)
+    margins = jax.vmap(problem.margin_or_one, (0, 1))(time + length, end)
     place = jnp.where((margins < 0.0) & (length > 0.0), 1.0, jnp.inf)
     if problem.fast[0]:
         start, side = states(0.0), jnp.ones_like(time)
@@ -431,7 +424,7 @@ def _loss(
     problem: AbstractProblem, solution: diffrax.Solution, begin: Float[Array, ""], end: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The last time in a bracket before the domain margin becomes negative, on the dense output."""
-    return halved(lambda time: ~(_guard(problem, time, solution.evaluate(time)) < 0.0), begin, end)[0]
+    return halved(lambda time: ~(problem.margin_or_one(time, solution.evaluate(time)) < 0.0), begin, end)[0]
 
 
 class _GivenSteps(diffrax.StepTo):

@@ -215,6 +215,10 @@ class AbstractProblem(eqx.Module):
         (base, rate), _ = jax.lax.scan(stage, (state, jnp.zeros_like(state)), (times, moves, looks))
         return base + second * rate
 
+    def margin_or_one(self, time: Lanes, state: States) -> Lanes:
+        """The domain margin; 1 if the model always holds."""
+        return lesser(self.domain_margin(time, state), None, time)
+
     def margin_at_start(self, time: Lanes, state: States) -> Lanes | None:
         """The domain margin at the start, at most 0 where the model ceases to hold at once."""
         margin, lost = self.domain_margin(time, state), self.lost_at_start(state)

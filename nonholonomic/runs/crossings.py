@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ..compilation.xla_cpu import compiled_alone, greatest, written_in_place
 from ..hybrid import MOST_ROUNDS
 from ..hybrid.ensemble import after_reset, after_solve, all_rounds, at_start, over_cells, time_left
-from ..hybrid.saltation import margin
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ..integration.scheduler import InLanes, LaneScheduler, Recorder, of_cells
@@ -112,7 +111,7 @@ def place_of(counted: Int[Array, "..."], skip: Array, count: int) -> Int[Array, 
 def on_margin(problem: AbstractProblem, time: Lanes, state: States) -> Bool[Array, " cells"]:
     """Whether runs that have spent some time [s] in a mode are at its end, up to `SAME`."""
     rates = problem.field(time, state)
-    value, slope = jax.jvp(functools.partial(margin, problem, time), (state,), (rates,))
+    value, slope = jax.jvp(functools.partial(problem.margin_or_one, time), (state,), (rates,))
     return (slope < 0.0) & (value <= -slope * SAME * time)
 
 
