@@ -21,7 +21,6 @@ from .xla_cpu import (
     bound,
     called_program,
     equations_in,
-    operations,
     programs_of,
     read_program,
     traced,
@@ -49,7 +48,7 @@ def is_elementary(function: Function, *args: PyTree) -> bool:
     except ValueError:
         # A loop without a fixed number of iterations has no backward pass.
         return False
-    return operations(program) <= set(ELEMENTARY.split())
+    return {equation.primitive.name for equation in equations_in(program)} <= set(ELEMENTARY.split())
 
 
 def dependent_outputs(function: Function, *args: PyTree, on_first_alone: bool = False) -> list[bool]:

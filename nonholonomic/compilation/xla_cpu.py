@@ -132,11 +132,6 @@ def equations_in(program: Program) -> list[Equation]:
     return [equation for inner in programs_in(program) for equation in inner.eqns]
 
 
-def operations(program: Program) -> set[str]:
-    """The names of the operations of a program and of the programs inside it."""
-    return {equation.primitive.name for equation in equations_in(program)}
-
-
 Result = TypeVar("Result")
 
 
@@ -294,7 +289,8 @@ def in_one_kernel(function: Function) -> Function:
     kernel is 2.5 times as fast with jaxlib 0.10.2, and 1.3 times as fast with 0.12. It can be removed when XLA's
     threshold can be set for one program.
 
-    XLA cannot put some operations into a kernel, such as sorts and calls of LAPACK: a function that has them is unchanged.
+    XLA cannot put some operations into a kernel, such as sorts, products of matrices, large sums and calls of LAPACK: a
+    function that has them is unchanged.
 
     JAX chooses the platform when it lowers a program; on platforms other than CPUs this function has no effect
     (`jax.export` lowers for platforms that this machine does not have).
@@ -308,7 +304,7 @@ def in_one_kernel(function: Function) -> Function:
         # them.
         with set_xla_metadata(**_ATTRIBUTES):
             closed, shape = traced(function, argument)
-        if not operations(closed).isdisjoint(OUTSIDE_KERNELS.split()):
+        if any(map(_is_outside, equations_in(closed))):
             return function(argument)
         program = with_constants_first(closed).jaxpr
         results = _kernel.bind(*closed.consts, *jax.tree.leaves(argument), program=program, context=context)
@@ -319,9 +315,20 @@ def in_one_kernel(function: Function) -> Function:
 
 #: Operations for which XLA calls a library, which the code of a single kernel cannot do.
 OUTSIDE_KERNELS = """
-    approx_top_k cholesky debug_callback eig eigh fft ffi_call geqp3 geqrf hessenberg householder_product io_callback lu
-    pure_callback qr schur sort svd top_k triangular_solve tridiagonal tridiagonal_solve
+    approx_top_k cholesky conv_general_dilated debug_callback dot_general eig eigh fft ffi_call geqp3 geqrf hessenberg
+    householder_product io_callback lu pure_callback qr schur sort svd top_k triangular_solve tridiagonal tridiagonal_solve
 """
+
+#: XLA also calls a library for sums, and for the greatest or the least, of at least so many numbers.
+LARGE_SUM = 4096
+
+
+def _is_outside(equation: Equation) -> bool:
+    """Whether XLA calls a library for an operation."""
+    name = equation.primitive.name
+    is_sum = name in ("reduce_sum", "reduce_max", "reduce_min")
+    return name in OUTSIDE_KERNELS.split() or (is_sum and equation.invars[0].aval.size >= LARGE_SUM)
+
 
 _ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 
