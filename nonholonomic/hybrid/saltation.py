@@ -124,7 +124,9 @@ class VariationalMode(AbstractBatchedMode):
             problem = mode.problem(primal)
             state, later = moved_with_event(problem, primal, duration)
             start_time = start_time + later
-            rate = jax.jvp(functools.partial(problem.margin_or_one, duration), (state,), (problem.field(duration, state),))[1]
+            rate = jax.jvp(
+                functools.partial(problem.margin_or_one, duration), (state,), (problem.field(duration, state),)
+            )[1]
             # A mode that ended when it began has not reached its event.
             log_rate = jnp.log(jnp.abs(jnp.where((duration > 0.0) & (rate != 0.0), rate, 1.0)))
             transition, path = reset_with_path(mode, state, left - start_time)
