@@ -17,10 +17,10 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from .. import views
 from ..compilation.tracing import named_errors
-from ..hybrid import MOST_ROUNDS, hybrid_resets
+from ..hybrid import MOST_ROUNDS, HybridOutcome, hybrid_resets
 from ..hybrid.ensemble import OnlyMode
 from ..integration import AbstractProblem, Settings
-from ..integration.problem import Status, run_bounds
+from ..integration.problem import CROSSED, Status, run_bounds
 from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
@@ -215,13 +215,13 @@ def live_run(
     drawn: AbstractModel,
     sliders: tuple[Slider, ...],
     t1: float,
-    outcome: Callable[[Any, Any], tuple[Array, Array]],
     frame: Callable[[Any, Any, Any, Any], Frame],
     *,
     title: str,
     answer: tuple[str, str],
-    words: Mapping[int, str] | None = None,
     summaries: tuple[int, ...],
+    named: Mapping[Status, Status] | None = None,
+    result: Callable[[Any, HybridOutcome, Array], Array] | None = None,
     motion: Callable[[Any], AbstractProblem] | None = None,
 ) -> LiveRun:
     """The contents of a page of any model.
@@ -229,10 +229,12 @@ def live_run(
     **Arguments:**
 
     - `model`, `drawn`: the model that answers, with its event, and that of the drawn run, for the same `sliders`.
-    - `outcome`: function of the model and a `HybridOutcome` that returns the `Status` and the result of a run, or infinity.
     - `frame`: function that returns a frame; its arguments are the drawn model, the time, the rows of the state, and the
       index of the mode, `None` for a smooth run.
     - `answer`: label and unit of the result; the others as for `LiveRun`.
+    - `named`: statuses in place of others, as in a table.
+    - `result`: function of the model, the outcome and the integer of its `Status` that returns the result, or infinity; by
+      default the time of the event.
     - `motion`: function that returns the problem of a smooth drawn run; by default that of the model.
     """
     settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
@@ -246,12 +248,20 @@ def live_run(
         problem = model.problem(1, names) if motion is None else motion(model)
         return (OnlyMode(problem),), jnp.zeros(1, int), problem.start()[0]
 
+    def outcome(values: Float[Array, " numbers"], ended: HybridOutcome) -> tuple[Array, Array]:
+        answering, time = at(model, values), jnp.where(ended.status[0] == CROSSED, ended.crossing_time[0], jnp.inf)
+        status = answering.ended(ended, TOLERANCE)[0]
+        number = time if result is None else result(answering, ended, status)
+        for code, other in (named or {}).items():
+            status = jnp.where(status == int(code), int(other), status)
+        return status, number
+
     options = (t1, settings, len(model.counters))
-    answering = Simulator(
+    answer_of = Simulator(
         lambda values: start(at(model, values), ()),
         *options,
         model.smooth and model.continues and model.has_event,
-        outcome=lambda values, ended: outcome(at(model, values), ended),
+        outcome=outcome,
     )
     moving = Simulator(
         lambda values: start(at(drawn, values), None, motion),
@@ -263,9 +273,8 @@ def live_run(
         title,
         sliders,
         lambda values: jnp.all(at(model, values).legal()),
-        answering,
+        answer_of,
         *answer,
-        words or {},
         moving,
         summaries,
     )

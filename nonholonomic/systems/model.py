@@ -17,12 +17,12 @@ from ..compilation.tracing import dependent_outputs, named_errors, with_own_numb
 from ..compilation.xla_cpu import Function
 from ..hybrid import HybridOutcome
 from ..integration import AbstractProblem, Outcome
-from ..integration.problem import CROSSED, FAILED, UNRESOLVED, Status
+from ..integration.problem import Status
 from ..parameters import Parameters, checks_of, require_apart, short_names
 from ..runs.event import UNMEASURED
 from ..runs.model import AbstractModel, Names, Start, model_of, run_of, statuses
 from ..runs.simulate import simulate_model
-from ..runs.trajectory import TOLERANCE, Trajectory, drawn_stage, frame_of, live_run, page_of, runs_at_ends, sliders_of
+from ..runs.trajectory import Trajectory, drawn_stage, frame_of, live_run, page_of, runs_at_ends, sliders_of
 from ..sweeps import Axis, Quantity, Variable
 from ..text import counted, name_of, shown
 from ..validation import as_number, is_traced
@@ -443,13 +443,9 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
     sliders = sliders_of(model, ranges)
     names, (draw, stage) = model.names, drawn_stage(runs_at_ends(model, sliders, t1), [0], [""])
 
-    def outcome(model: OwnModel, ended: HybridOutcome) -> tuple[Array, Array]:
-        if model.has_event:
-            result = jnp.where(ended.status == CROSSED, ended.crossing_time, jnp.inf)
-        else:
-            failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
-            result = jnp.where(failed, jnp.inf, model.components_of(ended.state[:, 0])[0])
-        return model.ended(ended, TOLERANCE)[0], result[0]
+    def first_component(model: OwnModel, ended: HybridOutcome, status: Array) -> Array:
+        failed = (status == int(Status.FAILED)) | (status == int(Status.UNRESOLVED))
+        return jnp.where(failed, jnp.inf, model.components_of(ended.state[:, 0])[0])
 
     def frame(model: OwnModel, time: Array, rows: Array, mode: object) -> Frame:
         components = model.components_of(rows[:, 0])
@@ -462,10 +458,10 @@ def page_of_system(model: OwnModel, ranges: dict[str, Any] | None, t1: float) ->
         model.without_event(),
         sliders,
         t1,
-        outcome,
         frame,
         title=model.title,
         answer=("time of the event", "s") if model.has_event else (f"{names[0]} at the end", ""),
         summaries=tuple(range(len(names[:2]))),
+        result=None if model.has_event else first_component,
     )
     return live, stage

@@ -594,7 +594,6 @@ class LiveRun(NamedTuple):
     - `sliders`: the sliders; `allowed`: function that returns whether their numbers are legal in combination.
     - `answer`: the simulator whose `outcome` is the result of a run, which the page also shows as a map; `label`, `unit`: those
       of the result.
-    - `words`: the words of statuses to which the page gives another name.
     - `motion`: the simulator of the drawn run, with its `frame`.
     - `summaries`: indices of the curves of the `Show` whose values at the start and the end of the run the page also shows as
       numbers, beside the result.
@@ -606,7 +605,6 @@ class LiveRun(NamedTuple):
     answer: Simulator
     label: str
     unit: str
-    words: Mapping[int, str]
     motion: Simulator
     summaries: tuple[int, ...]
 
@@ -634,7 +632,7 @@ def programs(live: LiveRun) -> str:
     values = jnp.array([slider.value for slider in live.sliders])
     facts = {
         "sliders": [slider._asdict() for slider in live.sliders],
-        "words": {int(status): status.word for status in Status} | dict(live.words),
+        "words": {int(status): status.word for status in Status},
         "answer": {"label": live.label, "unit": live.unit},
         "summaries": live.summaries,
     }

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from nonholonomic import views
 from nonholonomic.hybrid import HybridOutcome
@@ -25,7 +25,7 @@ from nonholonomic.views.stage import Kind
 from ..model.dynamics import State
 from ..model.input import Input
 from ..model.scene import DRIVES, Launch, RideProblem, Scene
-from .model import RideModel, checked_model
+from .model import FORM, RideModel, checked_model
 from .trajectory import MOST_GRIP, QUANTITIES, RideState, Trajectory
 
 # The drawing of a ride: the vehicle, the traces of its wheels, forces, and curves over time.
@@ -277,17 +277,25 @@ def page_of_ride(model: RideModel, sliders: Sliders | None, t1: float) -> tuple[
         values = {name: QUANTITIES[name].of(name, state)[0] for name in SHOWN}
         return frame_of(drawn.scene, normals(drawn.scene, values["position"]), values, rows[-3:, 0])
 
+    def distance(model: RideModel, ended: HybridOutcome, status: Array) -> Array:
+        """From the start of a ride to its end [m], infinite if the ride is not completed."""
+        problem: Any = model.problem(1, ())
+        first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(ended.state)[0]
+        squares = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
+        return jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)
+
     knobs = sliders_of(model, default_ranges(model.scene, model.launch) if sliders is None else sliders)
     live = live_run(
         model,
         model,
         knobs,
         t1,
-        outcome,
         frame,
         title=f"Stroller on a {type(model.scene.surface).__name__.lower()}",
         answer=("distance from the start", "m"),
         summaries=(0, 2),
+        named=FORM.named,
+        result=distance,
         motion=rolling,
     )
     rides = runs_at_ends(model, knobs, t1)
@@ -321,13 +329,3 @@ class WheelAngles(AbstractPassive):
         side_offset = 0.5 * TRACK * length * motion.yaw_rate
         speeds = jnp.stack([motion.speed - side_offset, motion.speed + side_offset, motion.front_speed])
         return jnp.concatenate([problem.field(time, state), speeds / (RADIUS * length)])
-
-
-def outcome(model: RideModel, ended: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
-    problem: Any = model.problem(1, ())
-    first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(ended.state)[0]
-    squares = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
-    status = model.ended(ended, TOLERANCE)[0]
-    status = jnp.where(status == int(Status.EVENT), int(Status.CONTACT_LOST), status)
-    return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(squares))[0], jnp.inf)

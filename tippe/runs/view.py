@@ -10,12 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from nonholonomic import views
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import Settings
-from nonholonomic.integration.problem import CROSSED, REACHED_END, Status
+from nonholonomic.integration.problem import REACHED_END
 from nonholonomic.parameters import numbers, numbers_of, with_numbers
 from nonholonomic.runs.event import Ensemble
 from nonholonomic.runs.model import Sliders
@@ -33,7 +33,7 @@ from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
 from ..modes.plane import Slide
 from ..modes.problems import event_of
-from .model import TopModel, of_launches
+from .model import INVERSIONS, REVERSALS, TopModel, of_launches
 from .observables import OF_RIGID_BODIES, QUANTITIES, AbstractTrajectory
 from .verbs import check_reversible, check_run
 
@@ -213,9 +213,6 @@ def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "poin
 #: Drawn radius of a level plane about the start of a run with flights, in units of sqrt(g R) t1.
 REACH = 0.5
 
-#: The words for the statuses of runs that end with a reversal of the spin.
-REVERSED = {int(Status.INVERTED): "reversed", int(Status.NOT_INVERTED): "not_reversed"}
-
 
 @of_launches
 @status_line("writing a page")
@@ -295,13 +292,12 @@ def page_of_launch(model: TopModel, sliders: Sliders | None, t1: float) -> LiveR
         TopModel.of(scene, launch),
         model,
         knobs,
-        float(t1),
-        outcome,
+        t1,
         lambda drawn, time, rows, mode: jax.tree.map(lambda part: part[0], frames(drawn.moment(rows, mode))),
         title=f"{kind} on a {type(scene.surface).__name__.lower()}",
         answer=("reversal time" if reverses else answer, "s"),
-        words=REVERSED if reverses else None,
         summaries=(1, 2),
+        named=(REVERSALS if reverses else INVERSIONS).named,
     )
 
 
@@ -323,14 +319,6 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
             value, most = float(values[path]), 0.9 * float(scene.body.size) if name == "offset" else math.inf
             ranges[path] = (low * value, min(high * value, most))
     return ranges
-
-
-def outcome(model: TopModel, ended: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """The `Status` of a run that ends with the inversion, and its inversion time [s], or infinity."""
-    status = model.ended(ended, TOLERANCE)[0]
-    for code, word in ((Status.EVENT, Status.INVERTED), (Status.COMPLETED, Status.NOT_INVERTED)):
-        status = jnp.where(status == int(code), int(word), status)
-    return status, jnp.where(ended.status[0] == CROSSED, ended.crossing_time[0], jnp.inf)
 
 
 def stage_at_start(model: TopModel, t1: float) -> views.Stage:
