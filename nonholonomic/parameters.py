@@ -244,31 +244,27 @@ def _plain_data(value: Any) -> Any:
 class TreeForm:
     """A tree without its numbers, which are listed one by one, in order within each array.
 
-    - `structure`: structure of the tree of numbers; `kinds`: shape and type of each leaf.
-    - `static_leaves`, `static_structure`: the leaves that are not numbers.
+    - `structure`: structure of the tree; `leaves`: its leaves, with `None` for each array of numbers.
+    - `kinds`: shape and type of each array of numbers.
     """
 
     structure: Any
+    leaves: tuple[Hashable, ...]
     kinds: tuple[tuple[tuple[int, ...], np.dtype], ...]
-    static_leaves: tuple[Hashable, ...]
-    static_structure: Any
 
     @classmethod
     def of(cls, tree: PyTree) -> tuple["TreeForm", tuple[Array, ...]]:
         """The form of a tree, and its numbers."""
-        numbers, static = eqx.partition(tree, is_number)
-        leaves, structure = jax.tree.flatten(numbers)
+        leaves, structure = jax.tree.flatten(tree)
         # With the type stated, one program serves Python's numbers and arrays.
-        arrays = [jnp.asarray(leaf, jnp.result_type(leaf)) for leaf in leaves]
-        static_leaves, static_structure = jax.tree.flatten(static)
-        kinds = tuple((array.shape, array.dtype) for array in arrays)
-        return cls(structure, kinds, tuple(static_leaves), static_structure), spread(arrays)
+        arrays = [jnp.asarray(leaf, jnp.result_type(leaf)) for leaf in leaves if is_number(leaf)]
+        static_leaves = tuple(None if is_number(leaf) else leaf for leaf in leaves)
+        return cls(structure, static_leaves, tuple((array.shape, array.dtype) for array in arrays)), spread(arrays)
 
     def tree(self, numbers: Sequence[Array]) -> PyTree:
         """The tree with the given numbers, each a scalar."""
-        leaves = gathered(numbers, [shape for shape, _ in self.kinds])
-        static = jax.tree.unflatten(self.static_structure, self.static_leaves)
-        return eqx.combine(jax.tree.unflatten(self.structure, leaves), static)
+        arrays = iter(gathered(numbers, [shape for shape, _ in self.kinds]))
+        return jax.tree.unflatten(self.structure, [next(arrays) if leaf is None else leaf for leaf in self.leaves])
 
     @property
     def types(self) -> tuple[jax.ShapeDtypeStruct, ...]:

@@ -106,7 +106,7 @@ class Traits(NamedTuple):
     - `depends_on_time`: whether a function depends on time, which is then an additional component of the state.
     - `elementary`: whether all functions that are evaluated within steps fit a single kernel.
     - `ends`, `resets`: for each mode, the number of its margins, and whether it also has a reset.
-    - `projected`: for each mode, whether it has constraints that a state may violate.
+    - `projected`: for each mode, whether it has constraints that a state may violate, so that `entered` changes its rates.
     - `large`: for each mode, whether its field takes much longer to compile than to compute.
     """
 
@@ -225,7 +225,7 @@ class Form:
             is_elementary(spelled_out(functools.partial(results, functions)), t, y, *numbers),
             ends,
             resets,
-            tuple(isinstance(mode, AbstractFormulation) and mode.is_projected for mode in modes),
+            tuple(isinstance(mode, Lagrange) and mode.system.freedom < mode.system.dimension for mode in modes),
             tuple(len(equations_in(field)) > LARGE for field in fields),
         )
 

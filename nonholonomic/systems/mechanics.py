@@ -420,9 +420,6 @@ class AbstractFormulation(AbstractMode):
     system: AbstractSystem
     input: Input | None = eqx.field(default=None, kw_only=True)
 
-    #: Whether states may have rates that violate the constraints, so that `entered` changes them.
-    is_projected: ClassVar[bool] = False
-
     @abc.abstractmethod
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
         """The state for coordinates and velocity, each (n,); the velocity must obey the constraints."""
@@ -518,10 +515,6 @@ class Lagrange(AbstractFormulation):
 
     **Arguments:** as for `AbstractFormulation`.
     """
-
-    @property
-    def is_projected(self) -> bool:
-        return self.system.freedom < self.system.dimension
 
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
         return jnp.concatenate([q, rate])
