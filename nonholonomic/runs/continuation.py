@@ -9,7 +9,7 @@ Theory, ch. 10.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -110,21 +110,19 @@ def several_returns(
     others: tuple[int, ...],
     state: Float[Array, " components"],
     rate: Array,
-    time: Array,
-    in_motion: Array,
+    near: Array,
     tolerance: Array,
     count: Array,
 ) -> Returns:
     """`count` returns from a state.
 
-    **Arguments:** `others`: the leaves that are the number; `rate`: derivative of the horizon by the number; `time`: about that
-    of a return [s]; `in_motion`: whether returns are not at a reset.
+    **Arguments:** `others`: the leaves that are the number; `rate`: derivative of the horizon by the number; `near`: a state
+    that is less than this time [s] before the section or beyond is moved onto it.
     """
 
     def following(k: Array, old: Returns) -> Returns:
         moved, shift, falls = search.on_section(leaves, 1, old.state[:, None])
-        is_near = in_motion & falls[0] & (jnp.abs(shift[0]) < NEAR * time)
-        state = jnp.where(is_near, moved[:, 0], old.state)
+        state = jnp.where(falls[0] & (jnp.abs(shift[0]) < near), moved[:, 0], old.state)
         left = jnp.where(old.reason > 0, 0.0, leaves[search.horizon])
         new = search.returned(search.with_start(leaves, state[:, None]), 1, others, tolerance, left)
         by_number = sum((part[0] for part in new.by_numbers), jnp.zeros_like(state))
@@ -145,6 +143,10 @@ def several_returns(
     zero, whole, size = jnp.zeros(()), jnp.zeros((), int), len(state)
     slopes = (jnp.eye(size, size + 1), jnp.zeros(size + 1))
     return jax.lax.fori_loop(0, count, following, Returns(state, zero, state, *slopes, whole > 0, whole, whole))
+
+
+#: The returns from a point, the derivative of the residual by the unknowns, and the unknowns, moved onto the section.
+Linear: TypeAlias = tuple[Returns, np.ndarray, np.ndarray]
 
 
 class Point(NamedTuple):
@@ -215,11 +217,11 @@ class Continuation(NamedTuple):
         leaves[search.horizon] = leaves[search.horizon] * float(periods)
         state, tolerance = np.array(self.orbit.state), max(float(leaves[-1]) / FINER, TIGHTEST)
         state[list(search.free)] = moved
-        time = float(self.orbit.period) / self.orbit.returns
-        numbers = map(np.asarray, (state, rate, time, self.in_motion, tolerance, self.returns))
+        near = NEAR * float(self.orbit.period) / self.orbit.returns * self.in_motion
+        numbers = map(np.asarray, (state, rate, near, tolerance, self.returns))
         return jax.tree.map(np.asarray, several_returns(search, tuple(leaves), self.others, *numbers))
 
-    def linearized(self, unknowns: np.ndarray) -> tuple[Returns, np.ndarray, np.ndarray]:
+    def linearized(self, unknowns: np.ndarray) -> Linear:
         """The returns, the derivative of the residual by the unknowns, and the unknowns at the start that was moved; raises
         `NoPoint` if a return fails."""
         new, free = self.evaluated(unknowns), list(self.orbit.search.free)
@@ -232,7 +234,7 @@ class Continuation(NamedTuple):
         """The point of the branch in the hyperplane through a guess across the tangent; raises `NoPoint` if there is none."""
         unknowns, tolerance = guess, float(self.orbit.leaves[-1])
         for iteration in range(1, MOST_NEWTON + 1):
-            new, matrix, unknowns = self.linearized(unknowns)
+            linear = new, matrix, unknowns = self.linearized(unknowns)
             miss, rows = (new.state - new.start) / self.scale, np.vstack([matrix, tangent])
             change = np.linalg.lstsq(rows, np.append(miss, tangent @ (guess - unknowns)), rcond=ROUND_OFF)[0]
             unknowns = unknowns + change
@@ -240,19 +242,13 @@ class Continuation(NamedTuple):
             if max(np.abs(miss).max() / size, np.abs(change).max() * tolerance**0.5) <= CONVERGED * tolerance:
                 along = np.linalg.svd(matrix)[2][-1]
                 along = along if along @ tangent >= 0.0 else -along
-                return self.point(new, matrix, along, unknowns, change, iteration)
+                return self.point(linear, along, change, iteration)
         raise NoPoint(DIVERGES)
 
-    def point(
-        self,
-        new: Returns,
-        matrix: np.ndarray,
-        tangent: np.ndarray,
-        unknowns: np.ndarray,
-        change: np.ndarray,
-        steps: int,
-    ) -> Point:
-        """The point with these unknowns, after the last step of Newton's method, their `change`."""
+    def point(self, linear: Linear, tangent: np.ndarray, change: np.ndarray, steps: int) -> Point:
+        """The point after the last step of Newton's method, the `change` of the unknowns from where it was linearized."""
+        new, matrix, begin = linear
+        unknowns = begin + change
         search, (*moved, value) = self.orbit.search, unknowns * self.units
         free, jacobian, span = list(search.free), np.asarray(new.by)[:, :-1], self.last - self.first
         state, last_step = np.array(new.start), np.zeros(len(new.start) + 1)
@@ -292,8 +288,7 @@ class Continuation(NamedTuple):
         part = distance / length
         tangent = old.tangent + 2.0 * part * bend + 3.0 * part**2 * twist
         unknowns = old.unknowns + distance * (old.tangent + part * bend + part**2 * twist)
-        returns, matrix, moved = self.linearized(unknowns)
-        return self.point(returns, matrix, tangent / np.linalg.norm(tangent), moved, np.zeros_like(moved), 0)
+        return self.point(self.linearized(unknowns), tangent / np.linalg.norm(tangent), np.zeros_like(unknowns), 0)
 
     def located(self, old: Point, new: Point, length: float, test: int) -> tuple[float, Point]:
         """Where a test function vanishes between two points: the distance from the first, and the point."""

@@ -117,9 +117,8 @@ class OrbitSolve(EventTime):
         timed, *leaves = EventTime.of(model, t1, settings, False)
         of_start = {id(number) for number in model.reduced_start}
         starts = tuple(k for k, leaf in enumerate(leaves) if id(leaf) in of_start)
-        parts = {field.name: getattr(timed, field.name) for field in dataclasses.fields(timed)}
-        parts["movable"] += 1
-        return (cls(**parts, starts=starts, is_driven=is_driven, free=free), *leaves)
+        fields = vars(timed) | {"movable": timed.movable + 1}
+        return (cls(**fields, starts=starts, is_driven=is_driven, free=free), *leaves)
 
     def __reduce__(self) -> tuple[type[None], tuple[()]]:
         # A user's classes may not be pickled, but the numbers of an orbit can.

@@ -16,6 +16,7 @@ from ..derivatives import SampledRun, sampled_run
 from ..hybrid import HybridOutcome, hybrid_samples, solve_hybrid_with_samples
 from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
 from ..integration.problem import Status, legal_run, require_times
+from ..integration.scheduler import of_cells
 from ..sweeps import Axis, Variable
 from ..terminal import status_line
 from ..validation import as_known, as_number, explaining, is_traced, nan_unless, warn
@@ -86,7 +87,7 @@ def _followed(
     """The outcome of the runs, their `Status`, and the named quantities at the samples."""
 
     def read(cell: Int[Array, "*lanes"], states: Float[Array, "rows components *lanes"]) -> dict[str, Array]:
-        of_lanes = jax.tree.map(lambda leaf: leaf if own_axis(leaf) is None else leaf[cell], cells)
+        of_lanes = of_cells(cells, cell)
         return eqx.filter_vmap(
             lambda model, states: model.read(names, jnp.full(len(states), jnp.nan), states.T, None),
             in_axes=(own_axis, -1),
