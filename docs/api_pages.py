@@ -199,7 +199,6 @@ MEMBERS = {
     "tippe.Launch": "degrees",
     "tippe.Top": "turned",
     "nonholonomic.Spheroid": "from_oblate",
-    "nonholonomic.Torus": "from_middle",
     "nonholonomic.AbstractSurface": "axes sides coordinates up normal normal_rate elevation gaussian_curvature nearest "
     "distance place_at charted in_fixed_frame in_own_axes",
     "tippe.AbstractFriction": "set_valued isotropic per_normal_force",
@@ -229,7 +228,7 @@ MEMBERS = {
     "nonholonomic.hybrid.Segment": "at",
     "nonholonomic.derivatives.VariationalProblem": "parts",
     "nonholonomic.sweeps.Quantity": "of",
-    "nonholonomic.identification.AbstractRecording": "columns size seen labels measurements",
+    "nonholonomic.identification.AbstractRecording": "columns seen labels measurements",
     "nonholonomic.identification.Quantities": "of",
     "nonholonomic.identification.LogDensity": "of names units start values predict replicate",
     "nonholonomic.sweeps.Tabular": "readable portrait_axes to_table to_xarray save portrait",
