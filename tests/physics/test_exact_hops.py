@@ -22,7 +22,7 @@ from tops import homogeneous_ball
 import tippe
 from tippe.model.dynamics import angular_velocity
 from tippe.modes.airborne import FLYING
-from tippe.modes.impact import approach, balls, energy, gap_rate, resolve_impact
+from tippe.modes.impact import approach, balls, resolve_impact
 from tippe.modes.sticking import TOUCH_ROLLING, TOUCH_SLIPPING
 
 NUMBERS, MU, THETA, SPIN, T1 = (0.02, 0.02, 0.016, 1.6e-6, 1.9e-6), 0.5, 1.5, 350.0, 0.276
@@ -45,15 +45,15 @@ def test_impacts_that_stick_or_slip_on():
     free_after, has_failed = impact_of(impacts)
     assert not np.asarray(has_failed).any()
     ball, free = balls(impacts.body)[0], impacts.free
-    gain = np.asarray(energy(impacts.body, 9.81, free_after)) / np.asarray(energy(impacts.body, 9.81, free))
+    gain = np.asarray(free_after.energy(impacts.body, 9.81)) / np.asarray(free.energy(impacts.body, 9.81))
     assert np.max(gain) < 1.0 + 1e-13
     slip = np.hypot(*np.asarray(approach(impacts.body, ball, free_after).velocity)[:2])
     # What sticks has no slip but for round-off.
     assert not np.any((slip > 1e-12) & (slip < 1e-6))
     assert 0.2 < np.mean(slip < 1e-12) < 0.5
     rebound, arrival = (
-        np.asarray(gap_rate(impacts.body, ball, free_after)),
-        -np.asarray(gap_rate(impacts.body, ball, free)),
+        np.asarray(free_after.gap_rate(impacts.body, ball)),
+        -np.asarray(free.gap_rate(impacts.body, ball)),
     )
     indices = np.flatnonzero(arrival > 1e-3)
     assert np.all((rebound > -1e-13)[indices])

@@ -15,8 +15,7 @@ from test_hops import scene_of
 
 import tippe
 from tippe.model.dynamics import angular_velocity
-from tippe.modes.impact import BOTH, FreeBody, LeaningDynamics, as_free_body, at_rest, balls, gap_rate
-from tippe.modes.impact import energy as energy_of
+from tippe.modes.impact import BOTH, FreeBody, LeaningDynamics, at_rest, balls
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 
@@ -27,7 +26,7 @@ FALLS_BACK, SHORT, RISES = 9, 10, 11
 
 def states_of_the_reference(scene: tippe.Scene, states: np.ndarray) -> np.ndarray:
     """s, u, e, w of states (8, times), as the reference has them, above the origin."""
-    free = as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states))
+    free = FreeBody.of(scene.body, balls(scene.body)[0], jnp.asarray(states))
     turning = angular_velocity(scene.body, free.axis, free.momentum)
     zero = np.zeros(states.shape[1])
     return np.stack([zero, zero, free.height, *free.velocity, *free.axis, *turning])
@@ -76,7 +75,7 @@ def test_the_contacts_that_hold():
     scene = scene_of(case)
     states = leaning_states(scene.body, 200, 2)
     _, number, definite = LeaningDynamics.of(scene).settled(
-        as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states))
+        FreeBody.of(scene.body, balls(scene.body)[0], jnp.asarray(states))
     )
     assert np.asarray(definite).all()
     outcomes = []
@@ -103,7 +102,7 @@ def test_friction_without_an_answer():
     scene = scene_of(case)
     states = leaning_states(scene.body, 200, 3)
     _, _, definite = LeaningDynamics.of(scene).settled(
-        as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states))
+        FreeBody.of(scene.body, balls(scene.body)[0], jnp.asarray(states))
     )
     for state, is_definite in zip(states_of_the_reference(scene, states).T, np.asarray(definite), strict=True):
         assert is_definite == (determinant(case, state) > 0.0)
@@ -128,15 +127,15 @@ def test_coming_to_rest_along_the_normal():
     random = np.random.default_rng(5)
     tilt = random.normal(scale=1e-6, size=20)
     states[5:7] += tilt * np.stack([-states[3], states[2]])
-    free_before = as_free_body(scene.body, spheres[1], jnp.asarray(states))
+    free_before = FreeBody.of(scene.body, spheres[1], jnp.asarray(states))
     free_after: FreeBody = at_rest(scene.body, free_before)
     for ball in spheres:
-        assert_close(gap_rate(scene.body, ball, free_after), 0.0, atol=1e-16)
+        assert_close(free_after.gap_rate(scene.body, ball), 0.0, atol=1e-16)
         assert_close(jellett(ball, free_after), jellett(ball, free_before), atol=1e-20)
     rate = tilt * math.sin(first_contact(scene.body))
     energy_loss = rate**2 / (2.0 * 8e-7) + 6e-3 * np.asarray(free_before.velocity[2]) ** 2 / 2.0
     assert_close(
-        energy_of(scene.body, 9.81, free_before) - energy_of(scene.body, 9.81, free_after),
+        free_before.energy(scene.body, 9.81) - free_after.energy(scene.body, 9.81),
         energy_loss,
         rtol=1e-8,
         atol=1e-17,
@@ -151,7 +150,7 @@ def test_the_end_of_rocking():
     """
     scene = scene_of(CASES[SHORT])
     spheres, states = balls(scene.body), leaning_states(scene.body, 50, 6)
-    free, impulses = as_free_body(scene.body, spheres[0], jnp.asarray(states)), []
+    free, impulses = FreeBody.of(scene.body, spheres[0], jnp.asarray(states)), []
     for striking in (0, 1):
         # The top turns about the sphere that stays.
         mode_segments, other_sphere = spheres[1 - striking], spheres[striking]
@@ -161,11 +160,11 @@ def test_the_end_of_rocking():
         tilt = rate * 8e-7 / np.sqrt(sine2)
         momentum = (*(L - tilt * a for L, a in zip(free.momentum[:2], horizontal, strict=True)), free.momentum[2])
         free_before = FreeBody((*free.velocity[:2], -mode_segments.offset * rate), free.height, free.axis, momentum)
-        assert_close(gap_rate(scene.body, other_sphere, free_before), -1e-6, rtol=1e-9)
-        assert_close(gap_rate(scene.body, mode_segments, free_before), 0.0, atol=1e-15)
+        assert_close(free_before.gap_rate(scene.body, other_sphere), -1e-6, rtol=1e-9)
+        assert_close(free_before.gap_rate(scene.body, mode_segments), 0.0, atol=1e-15)
         free_after, takes = LeaningDynamics.of(scene).stopped(free_before)
-        assert_close([gap_rate(scene.body, ball, free_after) for ball in spheres], 0.0, atol=1e-15)
-        energy_change = energy_of(scene.body, 9.81, free_after) - energy_of(scene.body, 9.81, free_before)
+        assert_close([free_after.gap_rate(scene.body, ball) for ball in spheres], 0.0, atol=1e-15)
+        energy_change = free_after.energy(scene.body, 9.81) - free_before.energy(scene.body, 9.81)
         assert np.all(np.asarray(energy_change)[np.asarray(takes)] < 0.0)
         impulses.append(np.asarray(takes))
     assert np.all(impulses[0] | impulses[1])
@@ -219,7 +218,7 @@ def test_while_it_leans(ride):
     assert_close(ride.theta[on_both], first_contact(ride.scene.body), atol=1e-9)
     free = free_body(ride.at(ride.t[on_both]))
     for ball in balls(ride.scene.body):
-        assert_close(gap_rate(ride.scene.body, ball, free), 0.0, atol=1e-11)
+        assert_close(free.gap_rate(ride.scene.body, ball), 0.0, atol=1e-11)
     weight = 6e-3 * 9.81
     forces = np.stack(LeaningDynamics.of(ride.scene).motion(jnp.asarray(ride.states[:, on_both])).normal_forces)
     assert forces.min() > -2e-8 * weight

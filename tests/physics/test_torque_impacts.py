@@ -14,7 +14,7 @@ from test_strong_friction import COUNT, Falls, impact_of, random_falls
 
 import tippe
 from tippe.model.dynamics import angular_velocity
-from tippe.modes.impact import balls, energy, gap_rate
+from tippe.modes.impact import balls
 
 
 def with_torques(impacts: Falls) -> Falls:
@@ -35,14 +35,14 @@ def test_impacts_with_torques():
     free_after, has_failed = impact_of(impacts)
     assert not np.asarray(has_failed).any()
     free, ball, law = impacts.free, balls(impacts.body)[0], impacts.friction
-    energy_before = np.asarray(energy(impacts.body, 9.81, free))
-    assert np.max(np.asarray(energy(impacts.body, 9.81, free_after)) / energy_before) < 1.0 + 1e-13
+    energy_before = np.asarray(free.energy(impacts.body, 9.81))
+    assert np.max(np.asarray(free_after.energy(impacts.body, 9.81)) / energy_before) < 1.0 + 1e-13
     numbers = (law.sliding.mu, law.sliding.slip_speed, law.sliding.contact_radius, law.resistance, law.turning_speed)
     velocity, turning = (
         np.stack(free_after.velocity),
         np.stack(angular_velocity(impacts.body, free_after.axis, free_after.momentum)),
     )
-    indices = np.flatnonzero(-np.asarray(gap_rate(impacts.body, ball, free)) > 1e-3)
+    indices = np.flatnonzero(-np.asarray(free.gap_rate(impacts.body, ball)) > 1e-3)
     for i in indices[:20]:
         body = Body(*(float(getattr(impacts.body, name)[i]) for name in Body._fields))
         motion = impacts.axis[:, i], impacts.velocity[:, i], impacts.turning[:, i]

@@ -4,7 +4,7 @@ import math
 
 import tippe
 from nonholonomic.geometry import dot
-from tippe.modes.impact import FreeBody, as_free_body, balls
+from tippe.modes.impact import FreeBody, balls
 
 
 def first_contact(body: tippe.Top) -> float:
@@ -23,5 +23,5 @@ def jellett(ball, free):
 
 def free_body(ride: tippe.HybridTrajectory) -> FreeBody:
     """The top of a run as a free body, also in contact."""
-    free, (distance, rate) = as_free_body(ride.scene.body, balls(ride.scene.body)[0], ride.states), ride.above
+    free, (distance, rate) = FreeBody.of(ride.scene.body, balls(ride.scene.body)[0], ride.states), ride.above
     return free._replace(velocity=(*free.velocity[:2], free.velocity[2] + rate), height=free.height + distance)

@@ -34,8 +34,6 @@ from .impact import (
     axis_rate,
     balls,
     closing_speed,
-    energy,
-    gap_rate,
     own_and_other,
     standing_on,
     still_parting,
@@ -160,7 +158,7 @@ def gap_margin(scene: Scene[Top], flying: FlightState, ball: Ball, rounding: flo
     **Arguments:** `rounding`: an additional allowance.
     """
     body, ground = scene.body, landing_site(scene, flying, ball)
-    rate = gap_rate(body, ball, flying_body(scene, flying, ground, ball))
+    rate = flying_body(scene, flying, ground, ball).gap_rate(body, ball)
     distance = add(*(jnp.abs(part) for part in flying.place))
     rounding = rounding + 4.0 * jnp.finfo(distance.dtype).eps * distance / body.radius
     return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
@@ -383,7 +381,7 @@ class Fly(AbstractFlyingMode):
         ground = below(self.scene, flying)
         free = flying_body(self.scene, flying, ground)
         c_vector = to_frame(tuple(state[OWN + k] for k in range(3)), ground.axes)
-        rate = gap_rate(self.scene.body, balls(self.scene.body)[0], free)
+        rate = free.gap_rate(self.scene.body, balls(self.scene.body)[0])
         rows = [jnp.stack(c_vector), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
         return jnp.concatenate([in_contact(ground, free), *rows])
 
@@ -416,7 +414,7 @@ class Fly(AbstractFlyingMode):
         if self.with_quadratures:
             c_vector, (spin_angle, work) = tuple(state[OWN + k] for k in range(3)), state[OWN + 3 :]
             c_vector = jnp.where(flies, jnp.stack(c_vector), jnp.stack(to_frame(c_vector, ground.axes)))
-            work = work + (energy(scene.body, 0.0, blow.free) - energy(scene.body, 0.0, free))
+            work = work + (blow.free.energy(scene.body, 0.0) - free.energy(scene.body, 0.0))
             state_after = jnp.concatenate([state_after, c_vector, jnp.stack([spin_angle, work])])
         if other_ball is not None:
             state_after = jnp.where(flies, state_after.at[LAST_BALL].set(number), state_after)
@@ -445,7 +443,7 @@ def _at_other(
     )
     site, closing = landing_site(scene, flying, other_ball), closing_speed(scene)
     rate_before, rate_after = (
-        gap_rate(scene.body, other_ball, flying_body(scene, motion, site, other_ball)) for motion in (flying, after)
+        flying_body(scene, motion, site, other_ball).gap_rate(scene.body, other_ball) for motion in (flying, after)
     )
     touches = site.gap < TOUCHING * scene.body.radius
     rests = touches & blow.is_slow & (jnp.abs(rate_before) <= closing)

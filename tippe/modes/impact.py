@@ -72,6 +72,36 @@ class FreeBody(NamedTuple):
     axis: Vector
     momentum: Vector
 
+    @classmethod
+    def of(cls, body: Top, ball: Ball, state: States) -> "FreeBody":
+        """A top that stands on a sphere, whose centre is at rest along the normal.
+
+        **Arguments:** `state`: (8, ...), as in `tippe/model/dynamics.py`.
+        """
+        velocity, axis, momentum, _ = parts(state)
+        height = ball.radius - ball.offset * axis[2]
+        return cls((*velocity, -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
+
+    @property
+    def contact_state(self) -> States:
+        """The state (8, ...) of a top in contact; the omitted components follow from the contact."""
+        return joined(self.velocity[:2], self.axis, self.momentum)
+
+    def gap(self, ball: Ball) -> Float[Array, "..."]:
+        """Distance [m] of a sphere from the plane."""
+        return self.height + ball.offset * self.axis[2] - ball.radius
+
+    def gap_rate(self, body: Top, ball: Ball) -> Float[Array, "..."]:
+        """Rate of that distance [m/s]."""
+        return self.velocity[2] + ball.offset * axis_rate(body, self.axis, self.momentum)[2]
+
+    def energy(self, body: Top, gravity: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+        """Kinetic energy plus weight times height above the plane [J]."""
+        axial = dot(self.momentum, self.axis)
+        transverse_square = dot(self.momentum, self.momentum) - axial**2
+        rotation = transverse_square / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
+        return body.mass * (0.5 * dot(self.velocity, self.velocity) + gravity * self.height) + rotation
+
 
 def balls(body: Top) -> tuple[Ball, ...]:
     """The spheres of a top with which it can touch the plane: its own, and that of its stem if it has one."""
@@ -101,34 +131,9 @@ def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
     return dataclasses.replace(dynamics, meridian=ContactGeometry(ball.offset, ball.radius, coupling))
 
 
-def as_free_body(body: Top, ball: Ball, state: States) -> FreeBody:
-    """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
-
-    **Arguments:** `state`: (8, ...), as in `tippe/model/dynamics.py`.
-    """
-    velocity, axis, momentum, _ = parts(state)
-    height = ball.radius - ball.offset * axis[2]
-    return FreeBody((*velocity, -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
-
-
-def contact_state(free: FreeBody) -> States:
-    """The state (8, ...) of a top in contact; the omitted components follow from the contact."""
-    return joined(free.velocity[:2], free.axis, free.momentum)
-
-
 def axis_rate(body: Top, axis: Vector, momentum: Vector) -> Vector:
     """Rate of the axis e' = L x e / I1 [1/s]."""
     return scale(1.0 / body.I1, cross(momentum, axis))
-
-
-def gap(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
-    """Distance [m] of a sphere from the plane."""
-    return free.height + ball.offset * free.axis[2] - ball.radius
-
-
-def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
-    """Rate of that distance [m/s]."""
-    return free.velocity[2] + ball.offset * axis_rate(body, free.axis, free.momentum)[2]
 
 
 def still_parting(
@@ -142,14 +147,6 @@ def still_parting(
     **Arguments:** `rate`: rate of the distance [m/s]; `rounding`: an allowance in addition to `ROUNDING`.
     """
     return (ROUNDING + rounding) * jnp.clip(1.0 + rate / (COMES_BACK * jnp.sqrt(gravity * radius)), 0.0, 1.0)
-
-
-def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float[Array, "..."]:
-    """Kinetic energy plus weight times height above the plane [J]."""
-    axial = dot(free.momentum, free.axis)
-    transverse_square = dot(free.momentum, free.momentum) - axial**2
-    rotation = transverse_square / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
-    return body.mass * (0.5 * dot(free.velocity, free.velocity) + gravity * free.height) + rotation
 
 
 #: Relative tolerance of an impact's integration: impacts are rare, so this cost is small. A tenfold value changes
@@ -350,7 +347,7 @@ def closing_speed(scene: Scene[Top]) -> Float[Array, "..."]:
 
 def strike(scene: Scene[Top], ball: Ball, free: FreeBody) -> Strike:
     """The impact of a sphere of a free body on the plane; a slow rebound closes the contact."""
-    speed = greatest(-gap_rate(scene.body, ball, free), 0.0)
+    speed = greatest(-free.gap_rate(scene.body, ball), 0.0)
     bounce = jnp.zeros_like(speed) + (0.0 if scene.restitution is None else scene.restitution)
     rebounds = bounce * speed > closing_speed(scene)
     free, fails = resolve_impact(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
@@ -628,7 +625,7 @@ class LeaningDynamics(AbstractDynamics):
             forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
             torques.append(sum_vectors(cross(contact.arm, forces[-1]), load.torque))
             gains.append(zero if (power := load.power(slip)) is None else power)
-        speeds = [gap_rate(self.body, ball, free) for ball in spheres]
+        speeds = [free.gap_rate(self.body, ball) for ball in spheres]
         rates = [axis_rate(self.body, free.axis, turn)[2] for turn in torques]
         (G_00, G_01), (G_10, G_11) = ([1.0 / self.body.mass + ball.offset * rate for rate in rates] for ball in spheres)
         determinant = G_00 * G_11 - G_01 * G_10
@@ -649,7 +646,7 @@ class LeaningDynamics(AbstractDynamics):
         which it stands; and whether this is the only solution.
         """
         free = at_rest(self.body, free)
-        state = contact_state(free)
+        state = free.contact_state
         number = jnp.where(self.contact_margin(state) > 0.0, BOTH, self.heavier(state))
         return free, number, self.motion(state).definiteness > INDEFINITE
 

@@ -34,14 +34,9 @@ from .impact import (
     Ball,
     FreeBody,
     LeaningDynamics,
-    as_free_body,
     at_rest,
     balls,
     closing_speed,
-    contact_state,
-    energy,
-    gap,
-    gap_rate,
     own_and_other,
     select,
     standing_on,
@@ -131,8 +126,8 @@ def _descent(
 ) -> Descent:
     """The distance of a sphere from the plane in flight."""
     motion = cone(body, free)
-    start = jnp.where(is_touching, 0.0, greatest(gap(ball, free), 0.0))
-    speed = gap_rate(body, ball, free)
+    start = jnp.where(is_touching, 0.0, greatest(free.gap(ball), 0.0))
+    speed = free.gap_rate(body, ball)
     speed = jnp.where(at_rest, 0.0, jnp.where(is_touching, greatest(speed, 0.0), speed))
     cosine, sine = ball.offset * motion.perpendicular[2], ball.offset * motion.binormal[2]
     # Where the normal force vanishes, the distance has no curvature: the remainder is round-off, and may only rise.
@@ -312,11 +307,11 @@ def land(scene: Scene[Top], air: Air) -> Air:
     if other_ball is not None:
         # The other sphere also strikes if it is at the plane, or the top comes to rest on both.
         closing = closing_speed(scene)
-        touches = gap(other_ball, air.free) < TOUCHING * scene.body.radius
-        falls = touches & (gap_rate(scene.body, other_ball, blow.free) < -closing)
+        touches = air.free.gap(other_ball) < TOUCHING * scene.body.radius
+        falls = touches & (blow.free.gap_rate(scene.body, other_ball) < -closing)
         leaning = LeaningDynamics.of(scene)
         stopped_body, dissipates = leaning.stopped(air.free)
-        rests = touches & blow.is_slow & (jnp.abs(gap_rate(scene.body, other_ball, air.free)) <= closing) & dissipates
+        rests = touches & blow.is_slow & (jnp.abs(air.free.gap_rate(scene.body, other_ball)) <= closing) & dissipates
         free, number, definite = leaning.settled(stopped_body)
         falls &= ~rests
         after_impact = after_impact._replace(
@@ -327,7 +322,7 @@ def land(scene: Scene[Top], air: Air) -> Air:
             open=blow.rebounds | falls,
         )
     if air.quadratures is not None:
-        before, after = (energy(scene.body, scene.gravity, free) for free in (air.free, after_impact.free))
+        before, after = (free.energy(scene.body, scene.gravity) for free in (air.free, after_impact.free))
         *path, work = air.quadratures
         after_impact = after_impact._replace(quadratures=jnp.stack([*path, work + (after - before)]))
     return after_impact._replace(open=after_impact.open & ~blow.fails)
@@ -407,7 +402,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         contact_ball, _ = own_and_other(self.scene.body, self.number)
-        return shown(self.scene.body, as_free_body(self.scene.body, contact_ball, state), state[OWN:])
+        return shown(self.scene.body, FreeBody.of(self.scene.body, contact_ball, state), state[OWN:])
 
     def between(
         self, motion: tuple[FreeBody, Float[Array, "7 times"]], passed: Float[Array, " times"]
@@ -455,7 +450,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         # A launch beyond the angle and without contact ends at once.
         is_beyond = ~jams & (state[COS_THETA] <= self.cos_angle) & (not self.last)
         return Air(
-            free=as_free_body(self.scene.body, contact_ball, state),
+            free=FreeBody.of(self.scene.body, contact_ball, state),
             elapsed=zero,
             ball=ball,
             rising=jnp.zeros(zero.shape, bool),
@@ -493,7 +488,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 
     def closed(self, air: Air) -> Transition:
         """The transition for a top that has returned to the plane, or whose run has ended."""
-        status, state = jnp.where(air.open, UNRESOLVED, air.status), contact_state(air.free)
+        status, state = jnp.where(air.open, UNRESOLVED, air.status), air.free.contact_state
         if air.quadratures is not None:
             state = jnp.concatenate([state, air.quadratures])
         counts = air.flights[None]
@@ -515,12 +510,12 @@ class Lean(AbstractFlyingMode):
         return self.extended(InversionProblem(*contact, flies=True), Quadratures(of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
-        return shown(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
+        return shown(self.scene.body, FreeBody.of(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
 
     def reset_map(self, state: States, left: Lanes) -> Transition:
         """Slide on the sphere whose normal force has not vanished."""
         number, body = LeaningDynamics.of(self.scene).heavier(state), self.scene.body
-        state_at_rest = contact_state(at_rest(body, as_free_body(body, balls(body)[0], state)))
+        state_at_rest = at_rest(body, FreeBody.of(body, balls(body)[0], state)).contact_state
         state = jnp.concatenate([state_at_rest, state[OWN:]])
         zero = jnp.zeros_like(state[0])
         running, zeros = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
@@ -565,6 +560,6 @@ def shown(body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."]) -> Floa
     """
     main = balls(body)[0]
     place = [x + main.offset * e for x, e in zip(quadratures[:2], free.axis[:2], strict=True)]
-    distance = (gap(main, free), gap_rate(body, main, free))
+    distance = (free.gap(main), free.gap_rate(body, main))
     rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *quadratures[2:], *distance)
     return jnp.stack(jnp.broadcast_arrays(*rows))

@@ -18,7 +18,7 @@ from ..model.rigid import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.stick_slip import ContactMode, Onset, StickSlip
 from . import airborne
-from .impact import as_free_body, balls, energy, gap_rate, select
+from .impact import FreeBody, balls, select
 from .problems import InversionProblem, Quadratures
 
 # Runs with stick and slip: the cells of a table, and a single run with its path. With flights, the flight is as in
@@ -177,8 +177,8 @@ def energy_in(scene: Scene, state: States, mode: Int[Array, " cells"]) -> tuple[
     if scene.flies_in_closed_form:
         # Where both spheres touch, either determines the height. The state has no speed of the sphere along the normal, which a
         # flight may give it.
-        free = as_free_body(scene.body, select(mode == 1, balls(scene.body)[-1], balls(scene.body)[0]), state)
-        total = energy(scene.body, scene.gravity, free)
+        free = FreeBody.of(scene.body, select(mode == 1, balls(scene.body)[-1], balls(scene.body)[0]), state)
+        total = free.energy(scene.body, scene.gravity)
         return total - 0.5 * scene.body.mass * free.velocity[2] ** 2, total
     energy_above, flies = 0.0, scene.contact == "hybrid"
     if flies:
@@ -216,7 +216,7 @@ def above_the_ground(
     flying = airborne.flight_state(flight)
     ground = airborne.below(scene, flying)
     free = airborne.flying_body(scene, flying, ground)
-    rate = gap_rate(scene.body, balls(scene.body)[0], free)
+    rate = free.gap_rate(scene.body, balls(scene.body)[0])
     contact = jnp.where(flies, airborne.in_contact(ground, free), state[: airborne.OWN])
     return contact, jnp.where(flies, ground.gap, 0.0), jnp.where(flies, rate, 0.0)
 
