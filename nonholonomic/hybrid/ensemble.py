@@ -721,10 +721,9 @@ def solve_hybrid_dense(
         end = begin + float(path.times[-1])
         segments.append(Segment(begin, end, number, modes[number], path, begin + path.times[1:]))
         # As for an ensemble of one cell.
-        status = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
         none, ending = np.full(1, np.inf), (np.asarray(path.times[-1:]), np.asarray(path.states[:, -1:]))
         counts = (np.full(1, path.accepted + path.rejected), np.full(1, path.rejected), np.array([NO_EXTREMES]).T)
-        return (after_solve(runs, Outcome(np.full(1, status), none, none, *ending, *counts), horizon),)
+        return (after_solve(runs, Outcome(np.full(1, path.status), none, none, *ending, *counts), horizon),)
 
     def reset(numbers: Sequence[int], cell: Int[np.ndarray, "1"], _: np.ndarray, carry: Carry) -> Carry:
         (runs,), mode = carry, modes[numbers[0]]

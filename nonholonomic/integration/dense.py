@@ -233,6 +233,11 @@ class DenseSolution(NamedTuple):
     accepted: int
     rejected: int
 
+    @property
+    def status(self) -> int:
+        """How the run ended, as a code of the integration."""
+        return FAILED if self.failed else LEFT_DOMAIN if self.left_domain else REACHED_END
+
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "components times"]:
         """States at the given times, by the dense output; times must lie within the run."""
         states = np.repeat(self.states[:, :1], len(times), axis=1)

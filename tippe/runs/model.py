@@ -100,21 +100,6 @@ SEVERAL = {
 #: All of these names.
 LABELS = tuple(label for parts in SEVERAL.values() for label, _ in parts)
 
-#: Parameters of a launch that can be varied.
-NUMBERS_OF_A_LAUNCH = [f"launch.{name}" for name in ("theta", "spin", "eta", "azimuth")]
-NUMBERS_OF_A_LAUNCH += [
-    f"launch.{name}[{k}]"
-    for name, count in (("place", 3), ("velocity", 2), ("angular_velocity", 3))
-    for k in range(count)
-]
-
-
-def variable_numbers(scene: Scene) -> list[str]:
-    """The full names of a scene's parameters that can be varied: single numbers, including omitted ones, which are
-    0."""
-    names = [name for name, value in numbers("scene", scene).items() if np.ndim(value) == 0]
-    return [name for name in names if name != "scene.restitution" or scene.contact == "hybrid"]
-
 
 # The top as a model.
 

@@ -13,16 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.hybrid import BETWEEN, MOST_ROUNDS, HybridOutcome, HybridPath, Segment, solve_hybrid_dense
 from nonholonomic.integration import DenseSolution, Settings, explicit_tableau, follow
-from nonholonomic.integration.problem import (
-    FAILED,
-    LEFT_DOMAIN,
-    REACHED_END,
-    UNRESOLVED,
-    Status,
-    require_adaptive,
-    require_adjoint,
-    require_times,
-)
+from nonholonomic.integration.problem import UNRESOLVED, Status, require_adaptive, require_adjoint, require_times
 from nonholonomic.runs.model import Number
 from nonholonomic.runs.simulate import sampled_if_legal
 from nonholonomic.text import shown
@@ -348,15 +339,11 @@ def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> A
     mode, counts = (path.numbers(times), path.counts) if isinstance(path, HybridPath) else (None, ())
     end = path.end_time if isinstance(path, HybridPath) and scene.contact == "hybrid" else jax.device_put(times[-1])
     rows, start = np.asarray(path.states), scene.state(model.launch)
-    if isinstance(path, HybridPath):
-        code, state, last_mode = path.status, path.state, path.mode
-    else:
-        code = FAILED if path.failed else LEFT_DOMAIN if path.left_domain else REACHED_END
-        state, last_mode = rows[:, -1], 0
+    state, last_mode = (path.state, path.mode) if isinstance(path, HybridPath) else (rows[:, -1], 0)
     one, none = np.ones(1), np.zeros(1, int)
     state, inf = np.asarray(state)[:, None], np.inf * one
     outcome = HybridOutcome(
-        none + code, inf, one, state, none, none, np.stack([inf, one, one]), none + last_mode, none[None]
+        none + path.status, inf, one, state, none, none, np.stack([inf, one, one]), none + last_mode, none[None]
     )
     status = Status(int(_ended(model, jax.tree.map(jnp.asarray, outcome), jnp.asarray(tolerance)))).word
     # The states and what else has a value for each time come next.

@@ -42,16 +42,7 @@ from ..model.dynamics import inclination, parts
 from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
 from ..modes.problems import InversionProblem, StemContact, angle_of, event_of
-from .model import (
-    INVERSIONS,
-    NUMBERS_OF_A_LAUNCH,
-    REVERSALS,
-    SEVERAL,
-    TopModel,
-    of_launches,
-    variable_numbers,
-    why_unresolved,
-)
+from .model import INVERSIONS, REVERSALS, SEVERAL, TopModel, of_launches, why_unresolved
 from .observables import QUANTITIES, quantities_of
 from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
@@ -196,7 +187,9 @@ def launches(
     require_kind(scene, "scene", Scene)
     if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
         raise ValueError(f"axes = {shown(axes)} must be a dictionary, path of a number -> values")
-    axes = full_axes(axes or {}, [*variable_numbers(scene), *NUMBERS_OF_A_LAUNCH])
+    # Those of a launch that leaves nothing out.
+    complete = Launch(0.0, 0.0, place=(0.0, 0.0, 0.0), velocity=(0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0))
+    axes = full_axes(axes or {}, TopModel(scene=scene, launch=complete).known)
     for name in ("theta", "spin") if launch_values.get("launch") is None else ():
         if launch_values.get(name, 0.0) is None:
             raise ValueError(f"{name} = None is not a number: pass a launch, or both theta and spin")
