@@ -214,17 +214,6 @@ class AbstractHoppingMode(AbstractBatchedMode):
         """The argument of `between` for a stretch that begins."""
 
 
-def over_cells(function: Callable[..., PyTree], mode: AbstractBatchedMode) -> Callable[..., PyTree]:
-    """Map a function of the mode of one run, and of more arguments, over cells, which are in the last axis of every
-    array."""
-
-    def mapped(*arguments: PyTree) -> PyTree:
-        axes = (lambda leaf: -1 if eqx.is_array(leaf) and leaf.ndim else None, *[-1] * len(arguments))
-        return eqx.filter_vmap(function, in_axes=axes, out_axes=-1)(mode, *arguments)
-
-    return mapped
-
-
 def program_groups(modes: Sequence[AbstractBatchedMode]) -> list[tuple[int, ...]]:
     """The indices of the modes, in groups. The modes of a group differ only in the values of their arrays, so they
     share a program."""

@@ -25,7 +25,7 @@ from ..derivatives.sampled_runs import AbstractSampling, Options, solve_for_samp
 from ..derivatives.variation import Tangent, by_active, where_active, with_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
-from ..integration.scheduler import of_cells
+from ..integration.scheduler import of_cells, over_cells
 from .ensemble import (
     BETWEEN,
     MOST_ROUNDS,
@@ -36,7 +36,6 @@ from .ensemble import (
     at_start,
     mode_numbered,
     one_round,
-    over_cells,
     program_groups,
     time_left,
 )

@@ -12,7 +12,7 @@ from ..compilation.xla_cpu import compiled_alone
 from ..derivatives import SampledRun, in_groups
 from ..integration import Lanes, Settings, States, solve_with_samples
 from ..integration.problem import LEFT_DOMAIN, REACHED_END
-from ..integration.scheduler import of_cells
+from ..integration.scheduler import of_cells, over_cells
 from .ensemble import (
     BETWEEN,
     AbstractBatchedMode,
@@ -27,7 +27,6 @@ from .ensemble import (
     all_rounds,
     at_start,
     mode_numbered,
-    over_cells,
     program_groups,
     resolution,
     time_left,

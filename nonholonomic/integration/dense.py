@@ -21,7 +21,7 @@ from ..validation import as_known, require
 from .events import Path, watched
 from .problem import CROSSED, FAILED, LEFT_DOMAIN, MOST_STEPS, REACHED_END, AbstractProblem, Settings
 from .runge_kutta import Lanes
-from .scheduler import NO_EXTREMES, Outcome
+from .scheduler import NO_EXTREMES, Outcome, over_cells
 
 # Find many zeros of functions of one variable at once. (Events within a step are located in `events.py`.)
 
@@ -546,9 +546,7 @@ def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: S
     def solve_cell(problem: AbstractProblem, state: Array, scales: Array) -> Outcome:
         return sample(problem, t1[None], t1, settings, ends_on_event=True, start=(state, scales))[0]
 
-    lane_axes = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
-    axes = Outcome._make((0, 0, 0, 0, -1, 0, 0, -1))
-    return jax.vmap(solve_cell, in_axes=(lane_axes, -1, -1), out_axes=axes)(problem, *problem.start())
+    return over_cells(solve_cell, problem)(*problem.start())
 
 
 # The implicit midpoint rule, whose energy balance closes to round-off on the P-form.

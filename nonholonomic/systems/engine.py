@@ -23,6 +23,7 @@ from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Components, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
+from ..integration.scheduler import over_cells
 from ..runs.event import ROUND_OFF, UNMEASURED, near_zero
 from .form import Form, State
 
@@ -212,9 +213,7 @@ class BatchedMode(AbstractBatchedMode):
         """
         zeros = jnp.zeros(state.shape[1:])
         event = near_zero(ModeProblem(self, state), zeros, state) if self.form.has_event else (zeros,) * 3
-        axes = (lambda leaf: -1 if eqx.is_array(leaf) and leaf.ndim else None, -1, -1, -1)
-        reset = eqx.filter_vmap(_after_reset, in_axes=axes, out_axes=-1)
-        return reset(self, state, self._exit(stop_gradient(state)), event)
+        return over_cells(_after_reset, self)(state, self._exit(stop_gradient(state)), event)
 
     def fallen(self, state: Float[Array, " components"]) -> str:
         """The name of the margin that ended the mode, or its index."""
