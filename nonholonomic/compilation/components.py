@@ -469,6 +469,17 @@ def _applied(equation: Equation, operands: list[Array]) -> Sequence[Array] | Pro
     return jax.vmap(lambda *operands: bound(equation, operands), in_axes=axes, out_axes=-1)(*operands)
 
 
+def over_cells(function: Function, tree: PyTree) -> Function:
+    """Map a function of a tree of one run, such as a problem or a mode, and of more arguments, over cells, which are in the
+    last axis of every array."""
+
+    def mapped(*arguments: PyTree) -> PyTree:
+        axes = (lambda leaf: -1 if eqx.is_array(leaf) and leaf.ndim else None, *[-1] * len(arguments))
+        return eqx.filter_vmap(function, in_axes=axes, out_axes=-1)(tree, *arguments)
+
+    return mapped
+
+
 # Users' objects, such as laws and surfaces, whose methods are written for a single run and evaluated in every lane.
 
 

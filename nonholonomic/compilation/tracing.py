@@ -13,7 +13,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..validation import UNTRACEABLE, is_traced, warn
-from .components import BY_ELEMENT
+from .components import BY_ELEMENT, over_cells
 from .xla_cpu import (
     Equation,
     Function,
@@ -232,9 +232,8 @@ def in_cells(
     **Arguments:** `numbers`: a tree of arrays, each with the cells in its last axis, or scalars for all cells; `shape`: that
     of the cells, () for a single run.
     """
-    axes = jax.tree.map(lambda leaf: -1 if jnp.ndim(leaf) else None, numbers)
     is_mapped = shape != () and any(jnp.ndim(leaf) for leaf in jax.tree.leaves(numbers))
-    times = jax.vmap(times_of, in_axes=(axes,), out_axes=-1)(numbers) if is_mapped else times_of(numbers)
+    times = over_cells(times_of, numbers)() if is_mapped else times_of(numbers)
     rows = [jnp.broadcast_to(time, shape) for time in times]
     return jnp.stack(rows) if rows else None
 

@@ -19,13 +19,14 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from ..compilation.components import over_cells
 from ..derivatives import SampledRun, tangents_of
 from ..derivatives.adjoint import SampledCotangents, mixture, samples_pulled_back, there_and_back
 from ..derivatives.sampled_runs import AbstractSampling, Options, solve_for_samples
 from ..derivatives.variation import Tangent, by_active, where_active, with_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
-from ..integration.scheduler import of_cells, over_cells
+from ..integration.scheduler import of_cells
 from .ensemble import (
     BETWEEN,
     MOST_ROUNDS,

@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from ..compilation.components import over_cells
 from ..compilation.xla_cpu import compiled_alone
 from ..derivatives import SampledRun, in_groups
 from ..integration import Lanes, Settings, States, solve_with_samples
 from ..integration.problem import LEFT_DOMAIN, REACHED_END
-from ..integration.scheduler import of_cells, over_cells
+from ..integration.scheduler import of_cells
 from .ensemble import (
     BETWEEN,
     AbstractBatchedMode,

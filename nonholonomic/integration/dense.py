@@ -15,13 +15,14 @@ import optimistix
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..compilation.cache import padded
+from ..compilation.components import over_cells
 from ..geometry import inverse
 from ..text import one_line
 from ..validation import as_known, require
 from .events import Path, watched
 from .problem import CROSSED, FAILED, LEFT_DOMAIN, MOST_STEPS, REACHED_END, AbstractProblem, Settings
 from .runge_kutta import Lanes
-from .scheduler import NO_EXTREMES, Outcome, over_cells
+from .scheduler import NO_EXTREMES, Outcome
 
 # Find many zeros of functions of one variable at once. (Events within a step are located in `events.py`.)
 

@@ -273,17 +273,6 @@ def of_cells(tree: Tree, cell: Int[Numbers, "..."] | int) -> Tree:
     return jax.tree.map(lambda leaf: leaf[..., cell] if eqx.is_array_like(leaf) and np.ndim(leaf) else leaf, tree)
 
 
-def over_cells(function: Callable[..., PyTree], tree: PyTree) -> Callable[..., PyTree]:
-    """Map a function of a tree of one run, such as a problem or a mode, and of more arguments, over cells, which are in the last
-    axis of every array."""
-
-    def mapped(*arguments: PyTree) -> PyTree:
-        axes = (lambda leaf: -1 if eqx.is_array(leaf) and leaf.ndim else None, *[-1] * len(arguments))
-        return eqx.filter_vmap(function, in_axes=axes, out_axes=-1)(tree, *arguments)
-
-    return mapped
-
-
 def outcome_of(lane_state: LaneState) -> Outcome:
     """How the cells in the lanes have ended."""
     times = (lane_state.first_crossing, lane_state.crossing_time, lane_state.time)

@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from ..compilation.components import over_cells
 from ..compilation.xla_cpu import compiled_alone, greatest, written_in_place
 from ..hybrid import MOST_ROUNDS
 from ..hybrid.ensemble import after_reset, after_solve, all_rounds, at_start, time_left
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
-from ..integration.scheduler import InLanes, LaneScheduler, Recorder, of_cells, over_cells
+from ..integration.scheduler import InLanes, LaneScheduler, Recorder, of_cells
 from ..integration.step import try_step
 from ..sweeps import Table, Variable
 from ..text import shown

@@ -17,13 +17,12 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..compilation.components import over_lanes
+from ..compilation.components import over_cells, over_lanes
 from ..compilation.tracing import in_cells
 from ..compilation.xla_cpu import least
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Components, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
-from ..integration.scheduler import over_cells
 from ..runs.event import ROUND_OFF, UNMEASURED, near_zero
 from .form import Form, State
 
