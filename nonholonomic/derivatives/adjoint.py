@@ -85,8 +85,8 @@ class Checkpoints(NamedTuple):
     def latest(self) -> tuple[Int[Array, ""], Period, "Checkpoints"]:
         """The number of the latest period, -1 if there is none, the period, and the checkpoints without it."""
         slot = jnp.argmax(self.numbers)
-        period = jax.tree.map(functools.partial(read, index=slot), self.periods)
-        return self.numbers[slot], period, self._replace(numbers=self.numbers.at[slot].set(-1))
+        without = self._replace(numbers=self.numbers.at[slot].set(-1))
+        return self.numbers[slot], read(self.periods, slot), without
 
     def added(self, number: Int[Array, ""], period: Period) -> "Checkpoints":
         """Add a period; if all places are taken, drop the period whose neighbours are closest, but not the first."""
@@ -132,9 +132,9 @@ class LatestSteps(NamedTuple):
         return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, period), self.ring)
 
 
-def read(stack: Array, index: Int[Array, ""]) -> Array:
-    """One of the arrays stacked in another."""
-    return jax.lax.dynamic_index_in_dim(stack, index, 0, keepdims=False)
+def read(stacks: PyTree, index: Int[Array, ""]) -> PyTree:
+    """A tree of stacks of arrays, (stack, ...), with one array of each stack."""
+    return jax.tree.map(lambda stack: jax.lax.dynamic_index_in_dim(stack, index, 0, keepdims=False), stacks)
 
 
 class Passes(NamedTuple):
@@ -401,7 +401,7 @@ def period_taken_back(
 
         def step(carry: tuple[Array, Derivatives, StageMemory]) -> tuple[Array, Derivatives, StageMemory]:
             index, adjoint, memory = carry
-            time, state, length, at_end = jax.tree.map(functools.partial(read, index=index - 1), record)
+            time, state, length, at_end = read(record, index - 1)
             if at_end is not None:
                 adjoint = adjoint._replace(state=adjoint.state + at_end)
             return index - 1, *step_taken_back(tableau, problem, moving, time, state, length, adjoint, memory)
@@ -468,7 +468,7 @@ def step_taken_back(
 
     def stage_made(stage: Int[Array, ""], carry: tuple[Stages, Array]) -> tuple[Stages, Array]:
         stage_states, rates = carry
-        rate = problem.field(time + fractions[stage] * length, read(stage_states, index=stage))
+        rate = problem.field(time + fractions[stage] * length, read(stage_states, stage))
         rates = written_by_component(rates, rate, at=stage)
         return written_in_place(stage_states, moved_state(stage, rows, state, length, rates), at=stage + 1), rates
 
@@ -484,7 +484,7 @@ def step_taken_back(
         def field(numbers: PyTree, parts: tuple[Lanes, ...]) -> States:
             return eqx.combine(numbers, static).field(stage_time, parts)
 
-        pull = jax.vjp(field, numbers, tuple(jnp.unstack(read(stage_states, index=stage))))[1]
+        pull = jax.vjp(field, numbers, tuple(jnp.unstack(read(stage_states, stage))))[1]
         by_number, by_part = pull(jnp.stack(jnp.unstack(by_rate)))
         # If no step was made, values may not be finite.
         by_state = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(by_part), 0.0))

@@ -308,22 +308,25 @@ def advanced(advance: Advance, numbers: Sequence[int], carry: Carry, mask: Bool[
     return jax.lax.cond(jnp.any(mask), of_masked, lambda: carry)
 
 
-def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance) -> Carry:
+def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance) -> tuple[Carry, Carry]:
     """Advance every running cell through its mode, and through the reset map if it is at the end of the mode.
 
     **Arguments:**
 
     - `groups`: the indices of the modes, in groups; one program serves the modes of a group.
     - `solve`, `reset`: advance the cells to the end of their mode, and through the reset map.
+
+    **Returns:** the carry at the ends of the modes, and after the resets.
     """
+    runs, ended = carry[0], carry
+    masks = [functools.reduce(operator.or_, (runs.mode == number for number in numbers)) for numbers in groups]
+    for numbers, mask in zip(groups, masks, strict=True):
+        ended = advanced(solve, numbers, ended, mask & (runs.status == RUNNING))
     # A cell that changes its mode during the round waits for the next round.
-    mode_before = carry[0].mode
-    for numbers in groups:
-        active = functools.reduce(operator.or_, (mode_before == number for number in numbers))
-        active = active & (carry[0].status == RUNNING)
-        carry = advanced(solve, numbers, carry, active)
-        carry = advanced(reset, numbers, carry, active & (carry[0].status == LEFT_DOMAIN))
-    return carry
+    after, is_lost = ended, (runs.status == RUNNING) & (ended[0].status == LEFT_DOMAIN)
+    for numbers, mask in zip(groups, masks, strict=True):
+        after = advanced(reset, numbers, after, mask & is_lost)
+    return ended, after
 
 
 def all_rounds(
@@ -335,16 +338,15 @@ def all_rounds(
 ) -> Carry:
     """Loop over rounds while a cell is running, on the host if the runs are NumPy arrays. **Arguments:** as for `one_round`."""
     xp = carry[0].status.__array_namespace__()
-    advance = functools.partial(one_round, groups=groups, solve=solve, reset=reset)
     if xp is np:
         for _ in range(most_rounds):
-            carry = advance(carry)
+            _, carry = one_round(carry, groups, solve, reset)
             if not (carry[0].status == RUNNING).any():
                 break
     else:
         carry, _ = jax.lax.while_loop(
             lambda loop: jnp.any(loop[0][0].status == RUNNING) & (loop[1] < most_rounds),
-            lambda loop: (advance(loop[0]), loop[1] + 1),
+            lambda loop: (one_round(loop[0], groups, solve, reset)[1], loop[1] + 1),
             (carry, jnp.zeros((), int)),
         )
     runs, *records = carry

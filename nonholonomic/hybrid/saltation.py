@@ -236,21 +236,24 @@ def along(
     return jax.vmap(moved, out_axes=(None, 0, None) if has_aux else (None, 0))(stacked)
 
 
-def variational_modes(
-    modes: tuple[AbstractBatchedMode, ...], tangents: Tangents, tolerance: Float[Array, ""], ends_on_event: bool
-) -> tuple[VariationalMode, ...]:
-    """The modes with their variations. **Arguments:** as for `solve_hybrid_with_tangents`."""
-    return tuple(
+def with_variations(
+    modes: tuple[AbstractBatchedMode, ...],
+    state: States,
+    tangents: Tangents,
+    tolerance: Float[Array, ""],
+    ends_on_event: bool,
+) -> tuple[tuple[VariationalMode, ...], Float[Array, "variational *lanes"]]:
+    """The modes with their variations, and the initial states with their clocks, followed by the variations of both.
+
+    **Arguments:** as for `solve_hybrid_with_tangents`.
+    """
+    zero = jnp.zeros_like(state[0])
+    variations = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]
+    variational = tuple(
         VariationalMode(mode, tuple(direction[0][k] for direction in tangents), tolerance, ends_on_event)
         for k, mode in enumerate(modes)
     )
-
-
-def variational_start(state: States, tangents: Tangents) -> Float[Array, "variational *lanes"]:
-    """Initial states with their clocks, followed by the variations of both."""
-    zero = jnp.zeros_like(state[0])
-    variations = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]
-    return jnp.concatenate([with_row(part, zero) for part in (state, *variations)])
+    return variational, jnp.concatenate([with_row(part, zero) for part in (state, *variations)])
 
 
 # Ensembles of hybrid runs with the derivatives of the times of their events.
@@ -302,10 +305,9 @@ def solve_hybrid_with_tangents(
     size, slopes_of = len(state), VariationalMode.slopes if traced else _slopes
 
     def run(group: Tangents) -> tuple[PyTree, list[Float[Numbers, " cells"]]]:
-        variational = variational_modes(modes, group, settings.tolerance, ends_on_event)
-        start = xp.asarray(variational_start(jnp.asarray(state), group))
+        variational, start = with_variations(modes, jnp.asarray(state), group, settings.tolerance, ends_on_event)
         options = {"counters": counters + 1, "n_blocks": 1 + len(group), "traced": traced}
-        ended = solve_hybrid(variational, mode, start, t1, cells, settings, **options)
+        ended = solve_hybrid(variational, mode, xp.asarray(start), t1, cells, settings, **options)
         # A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is
         # the last row.
         slopes = xp.reshape(ended.state, (1 + len(group), -1, len(ended.mode)))[1:, -1]

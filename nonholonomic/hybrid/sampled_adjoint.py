@@ -40,7 +40,7 @@ from .ensemble import (
     program_groups,
     time_left,
 )
-from .saltation import VariationalMode, along, moved_with_event, variational_modes, variational_start
+from .saltation import VariationalMode, along, moved_with_event, with_variations
 from .samples import Built, Recorded, output_rows, reset_with_rows, sampled_rounds, sampled_with_tangents, weighted
 
 #: From some modules (scene, launch, ...), the tolerance and a number of cells to the modes, the index of the first mode
@@ -240,8 +240,8 @@ def hybrid_samples_pulled_back(
     """
     modes, first, state = build(*point)
     tangent = tangents_of(lambda *point: build(*point)[::2], point, [tuple(mixture(point))])
-    variational = variational_modes(modes, tangent, settings.tolerance, False)
-    cells, states = state.shape[1], variational_start(state, tangent)
+    variational, states = with_variations(modes, state, tangent, settings.tolerance, False)
+    cells = state.shape[1]
     start = at_start(first, states, cells, counters + 1)
     (runs, output), groups, solve, reset = sampled_rounds(variational, start, times, t1, settings, 2)
     # At the start, only the output rows that the tangent moves count.
@@ -249,17 +249,10 @@ def hybrid_samples_pulled_back(
     _, (rate,) = output_rows(variational, initial)
     shown = jnp.where((times <= 0.0) & (rate == 0.0), 0.0, shown)
 
-    def solved(numbers: Sequence[int], cell: Int[Array, " cells"], count: Int[Array, ""], carry: Carry) -> Carry:
-        runs, output = solve(numbers, cell, count, carry[:2])
-        return runs, output, runs
-
-    def left(numbers: Sequence[int], cell: Int[Array, " cells"], count: Int[Array, ""], carry: Carry) -> Carry:
-        return (*reset(numbers, cell, count, carry[:2]), carry[2])
-
     # The samples so far, and the rounds that they belong to.
     def forward(number: Int[Array, ""], before: HybridOutcome[Array], recorded: Carry) -> tuple[PyTree, Kept, Carry]:
         output, owner = recorded
-        after, new_output, ended = one_round((before, output, before), groups, solved, left)
+        (ended, _), (after, new_output) = one_round((before, output), groups, solve, reset)
         is_new = jnp.isnan(output.number) & ~jnp.isnan(new_output.number)
         kept = Kept(before, ended, after.status, after.counts[-1] > before.counts[-1])
         return after, kept, (new_output, jnp.where(is_new, number, owner))

@@ -32,7 +32,7 @@ from .ensemble import (
     resolution,
     time_left,
 )
-from .saltation import Tangents, VariationalMode, variational_modes, variational_start
+from .saltation import Tangents, VariationalMode, with_variations
 
 #: The modes, the index of the first mode of every cell, and the initial states.
 Built = tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], States]
@@ -275,8 +275,8 @@ def sampled_with_tangents(
     times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), runs))
 
     def run(group: Tangents) -> tuple[SampledRun, list[SampledRun]]:
-        variational = variational_modes(modes, group, settings.tolerance, False)
-        start = at_start(first, variational_start(state, group), cells, counters + 1)
+        variational, states = with_variations(modes, state, group, settings.tolerance, False)
+        start = at_start(first, states, cells, counters + 1)
         rounds = sampled_rounds(variational, start, times, jnp.broadcast_to(t1, (runs,)), settings, 1 + len(group))
         ended, output = all_rounds(*rounds)
         rows, variations = output_rows(variational, output)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from ..derivatives import exponent_of, growth
 from ..derivatives.variation import in_stretches, orthonormalised
 from ..hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
-from ..hybrid.saltation import variational_modes, variational_start
+from ..hybrid.saltation import with_variations
 from ..integration import Outcome, Settings
 from ..integration.problem import DEFAULT_MAX_STEPS, Status
 from ..sweeps import Axis, Table, Variable
@@ -335,7 +335,7 @@ def _through_modes(
     cells = tangents.shape[-1]
     modes, first, states = modes_of(model, cells, settings.tolerance, model.comparable)
     pairs = tuple((tuple(jax.tree.map(lambda _: None, mode) for mode in modes), change) for change in tangents)
-    variational = variational_modes(modes, pairs, settings.tolerance, False)
+    variational, start = with_variations(modes, states, pairs, settings.tolerance, False)
     size, counters, blocks = len(states), len(model.counters) + 1, 1 + len(pairs)
 
     def advance(runs: Any, begin: float, duration: float) -> tuple[Array, Any, HybridOutcome]:
@@ -345,7 +345,7 @@ def _through_modes(
         mode = np.minimum(outcome.mode, len(modes) - 1)
         return logarithm, (mode, np.asarray(state)), outcome._replace(state=outcome.state[:size])
 
-    _, state = _rescaled(modes, jnp.asarray(first), variational_start(states, pairs), size)
+    _, state = _rescaled(modes, jnp.asarray(first), start, size)
     logarithm, ended = in_stretches(advance, (np.asarray(first), np.asarray(state)), t1, STRETCHES)
     return logarithm, ended._replace(counts=ended.counts[:-1])
 

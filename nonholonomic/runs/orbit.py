@@ -22,7 +22,7 @@ from ..derivatives import differentiable_solve, tangent_scale, tangents_by
 from ..derivatives.variation import delay
 from ..geometry.vector import nearest_turn
 from ..hybrid import solve_hybrid
-from ..hybrid.saltation import VariationalMode, along, variational_modes, variational_start
+from ..hybrid.saltation import VariationalMode, along, with_variations
 from ..integration import Settings
 from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESOLVED
 from ..parameters import Parameters, as_one
@@ -186,8 +186,8 @@ class OrbitSolve(EventTime):
 
         (modes, first, states), tangents, gather = tangents_by(build, active, leaves, cells)
         pairs = tuple((of_modes, of_states) for of_modes, _, of_states in tangents)
-        modes = variational_modes(modes, pairs, tolerance, not self.is_driven)
-        start, size = variational_start(states, pairs), len(states)
+        modes, start = with_variations(modes, states, pairs, tolerance, not self.is_driven)
+        size = len(states)
         options = {"counters": 1 + max(1, len(self.model(leaves).counters)), "n_blocks": 1 + len(pairs), "traced": True}
         ended = solve_hybrid(modes, first, start, left, cells, settings, **options)
         rows = jnp.reshape(ended.state, (1 + len(pairs), size + 1, cells))
