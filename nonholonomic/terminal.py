@@ -59,8 +59,10 @@ class Progress:
         - `shown`: whether to show anything at all, including calls within this one.
         """
         self._total, self._unit, self._doing = total, unit, doing
-        self._watched = is_watched()
-        can_tell = not self._has_told and not getattr(sys.stderr, "closed", sys.stderr is None)
+        # A closed stream raises an error.
+        is_open = not getattr(sys.stderr, "closed", sys.stderr is None)
+        self._watched = (is_open and getattr(sys.stderr, "isatty", bool)()) or is_notebook()
+        can_tell = is_open and not self._has_told
         self._heard = not is_off("NONHOLONOMIC_PROGRESS") and (self._watched or can_tell)
         self._shown = shown
         self._done, self._first, self._since, self._notes = 0, 0, None, {}
@@ -185,13 +187,6 @@ def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
     forget_programs_if_many()
     with Progress(None, doing=doing, shown=shown) as line:
         yield line
-
-
-def is_watched() -> bool:
-    """Whether a status line would be visible: standard error is a terminal, or this process is a notebook."""
-    # A closed stream raises an error.
-    is_open = not getattr(sys.stderr, "closed", False)
-    return (is_open and getattr(sys.stderr, "isatty", bool)()) or is_notebook()
 
 
 def is_notebook() -> bool:

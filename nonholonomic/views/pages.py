@@ -351,8 +351,7 @@ class Viewable:
         require_package("jupyter_threejs_sage", "view", "view")
         if path is not None:
             require_file(path, "path", ".html", ".htm")
-        stages = self._stages(others, overlaid, unit, draw, label)
-        html_page = page(stages, "; ".join(stage.title for stage in stages), speed=0.5)
+        html_page = self._page(others, overlaid, unit, draw, label, speed=0.5)
         if path is not None:
             html_page.save(path)
         return html_page
@@ -406,20 +405,21 @@ class Viewable:
                 "animate needs Chromium, Chrome or Edge, and finds none: install one, for example by `apt install chromium` or "
                 "from google.com/chrome; or open the page of run.view(path) in any browser and press its button Save film"
             )
-        stages = self._stages(others, overlaid, unit, draw, label)
-        scripts = [script(RECORD.replace("[REQUEST]", json.dumps(request)))]
-        html_page = page(
-            stages, "; ".join(stage.title for stage in stages), height=HEIGHT, scripts=scripts, autoplay=False
-        )
+        recording = {"scripts": [script(RECORD.replace("[REQUEST]", json.dumps(request)))], "autoplay": False}
+        html_page = self._page(others, overlaid, unit, draw, label, height=HEIGHT, **recording)
         with replacing(file) as scratch:
             scratch.write_bytes(recorded(html_page, browser))
 
-    def _stages(self, others: Sequence[Any], overlaid: bool, unit: Unit, draw: Draw, label: Label) -> list[Stage]:
-        """The stages in a unit, after a check of the unit and that the others are runs of the same package."""
+    def _page(
+        self, others: Sequence[Any], overlaid: bool, unit: Unit, draw: Draw, label: Label, **options: Any
+    ) -> Page:
+        """The page in a unit, after a check of the unit and that the others are runs of the same package. **Arguments:**
+        `options`: of `page`."""
         require_unit(unit)
         runs, unit = [cast(Any, self), *require_others(self, others)], unit or unit_of(self)
         runs = runs if draw is None else [run.drawn_by(draw) for run in runs]
-        return curves_in(runs[0].stages(runs[1:], overlaid, unit, label), unit)
+        stages = curves_in(runs[0].stages(runs[1:], overlaid, unit, label), unit)
+        return page(stages, "; ".join(stage.title for stage in stages), **options)
 
 
 def require_others(run: object, others: Any) -> Sequence[Any]:

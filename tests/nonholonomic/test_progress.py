@@ -229,7 +229,8 @@ def test_nobody_watches_a_stream_that_is_closed(closed, monkeypatch):
     stream = io.TextIOWrapper(io.BytesIO())
     stream.close()
     monkeypatch.setattr(sys, "stderr", stream if closed else None)
-    assert not progress_module.is_watched()
+    with status_line("planning") as line:
+        assert not line._watched
 
 
 @pytest.mark.parametrize("widgets", [True, False])
