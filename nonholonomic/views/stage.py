@@ -5,6 +5,7 @@ seconds.
 """
 
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -470,10 +471,11 @@ def own(surface: AbstractSurface, position: np.ndarray) -> tuple:
     return surface.in_own_axes(tuple(np.asarray(part, dtype=float) for part in position))
 
 
-def fixed(surface: AbstractSurface, vector: tuple) -> np.ndarray:
-    """A vector in the surface's axes, converted to the fixed frame, (..., 3)."""
-    components = np.broadcast_arrays(*(0.0 if part is None else np.asarray(part) for part in vector))
-    return np.stack(surface.in_fixed_frame(components), axis=-1)
+def fixed(surface: AbstractSurface, vector: tuple, xp: ModuleType = np) -> np.ndarray:
+    """A vector in the surface's axes, converted to the fixed frame, (..., 3). **Arguments:** `xp`: NumPy, or `jax.numpy` inside
+    transformations."""
+    components = xp.broadcast_arrays(*(0.0 if part is None else xp.asarray(part) for part in vector))
+    return xp.stack(surface.in_fixed_frame(components), axis=-1)
 
 
 def nice(step: float, is_angle: bool) -> tuple[float, str]:

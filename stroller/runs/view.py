@@ -20,7 +20,7 @@ from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit
 from nonholonomic.validation import explaining
 from nonholonomic.views.explore import Frame, LiveRun
-from nonholonomic.views.stage import Kind
+from nonholonomic.views.stage import Kind, fixed
 
 from ..model.dynamics import State
 from ..model.input import Input
@@ -81,11 +81,8 @@ def ground_of(rides: list[Trajectory], normal: np.ndarray, *more: np.ndarray) ->
 def normals(scene: Scene, position: Kind) -> Kind:
     """Unit normals of the ground at positions (*times, 3), towards the stroller."""
     xp, surface = position.__array_namespace__(), scene.surface
-    zero = xp.zeros(position.shape[:-1])
-    components = surface.normal(surface.in_own_axes(tuple(position.T)))
-    filled = tuple(zero if part is None else xp.asarray(part) + zero for part in components)
-    outward = xp.stack([xp.asarray(part) for part in surface.in_fixed_frame(filled)], axis=-1)
-    return surface.sign(scene.side, DRIVES) * outward
+    outward: Any = fixed(surface, surface.normal(surface.in_own_axes(tuple(position.T))), xp)
+    return surface.sign(scene.side, DRIVES) * xp.broadcast_to(outward, position.shape)
 
 
 def frame_of(scene: Scene, normal: Kind, values: dict[str, Kind], angles: Sequence[Kind] | Kind) -> Frame[Kind]:
