@@ -13,7 +13,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..validation import UNTRACEABLE, is_traced, warn
-from .components import BY_ELEMENT, over_cells
+from .components import BY_ELEMENT, over_cells, spelled_out
 from .xla_cpu import (
     Equation,
     Function,
@@ -37,10 +37,11 @@ ELEMENTARY = f"""{BY_ELEMENT}
 
 
 def is_elementary(function: Function, *args: PyTree) -> bool:
-    """Whether a function and its derivatives consist of operations that fit a single kernel."""
+    """Whether a function and its derivatives consist of operations that fit a single kernel, with products of small matrices as
+    sums."""
 
     def pulled_back(*args: PyTree) -> PyTree:
-        values, pull = jax.vjp(function, *args)
+        values, pull = jax.vjp(spelled_out(function), *args)
         return pull(jax.tree.map(jnp.ones_like, values))
 
     try:

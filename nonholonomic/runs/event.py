@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..compilation.components import over_lanes, spelled_out
+from ..compilation.components import over_lanes
 from ..compilation.tracing import dependent_outputs, is_elementary, with_own_numbers
 from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, solve_ensemble_with_tangents, tangents_by
 from ..hybrid import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid, solve_hybrid_with_tangents
@@ -131,7 +131,7 @@ def with_event(model: AbstractModel, event: Any) -> AbstractModel:
         moved = jax.tree.unflatten(structure, leaves)
         return moved.event(t, moved.read(names, t, rows, index))
 
-    elementary = model.smooth and is_elementary(spelled_out(of_leaves), *types)
+    elementary = model.smooth and is_elementary(of_leaves, *types)
     return dataclasses.replace(model, event=dataclasses.replace(model.event, elementary=elementary))
 
 

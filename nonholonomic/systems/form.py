@@ -222,7 +222,7 @@ class Form:
         modes = self.tree.tree([jnp.zeros((), kind.dtype) for kind in numbers]).modes
         return Traits(
             depends_on_time,
-            is_elementary(spelled_out(functools.partial(results, functions)), t, y, *numbers),
+            is_elementary(functools.partial(results, functions), t, y, *numbers),
             ends,
             resets,
             tuple(isinstance(mode, Lagrange) and mode.system.freedom < mode.system.dimension for mode in modes),

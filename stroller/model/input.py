@@ -17,7 +17,7 @@ import numpy as np
 from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, Float, PyTree
 
-from nonholonomic.compilation.components import Held, TooLarge, by_components, over_last_axis, spelled_out
+from nonholonomic.compilation.components import Held, TooLarge, by_components, over_last_axis
 from nonholonomic.compilation.tracing import TracedFunction, in_cells, is_elementary, jumps_of, warn_of_unclear
 from nonholonomic.compilation.xla_cpu import with_constants_first
 from nonholonomic.geometry import Vector
@@ -246,7 +246,7 @@ class PerRide(eqx.Module):
         example = (arrays, (t, motion))
         with contextlib.suppress(TooLarge):
             jax.eval_shape(by_components(of_ride, *example), *example)
-            return cls(controls, is_elementary(spelled_out(of_ride), *example))
+            return cls(controls, is_elementary(of_ride, *example))
         return cls(controls, False)
 
     def of_cells(self, cells: int) -> "PerRide":
