@@ -215,17 +215,13 @@ def launches(
     # A launch with entries for all given numbers.
     sizes = {name: len(parts) for name, parts in SEVERAL.items()}
     sizes["place"] = 3 if "launch.place[2]" in values else len(scene.surface.coordinates)
-    parts = {name: [f"launch.{name}[{k}]" for k in range(size)] for name, size in sizes.items()}
-    vectors = {
-        name: tuple(scalars.get(part, 0.0) for part in own) for name, own in parts.items() if set(own) & set(values)
-    }
-    angles = {name: scalars.get(f"launch.{name}", 0.0) for name in ("theta", "spin", "eta", "azimuth")}
-    launch = Launch(**angles, **vectors).stated_in(unit_of(stated))
-    names = TopModel(scene=scene, launch=launch).label(list(values), taken)
+    given = {number.partition("[")[0] for number in values}
+    vectors = {name: (0.0,) * size for name, size in sizes.items() if f"launch.{name}" in given}
+    roots = with_numbers({"launch": Launch(0.0, 0.0, **vectors), "scene": scene}, scalars)
+    roots["launch"].stated_in(unit_of(stated))
+    names = TopModel(**roots).label(list(values), taken)
     listed = [(number, *names[number]) for number in values if number not in scalars]
     grid = [axis(name, number, unit, values[number], long_name) for number, name, unit, long_name in listed]
-    of_scene = {number: value for number, value in scalars.items() if not number.startswith("launch.")}
-    roots = with_numbers({"scene": scene}, of_scene) | {"launch": launch}
     # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
     require_run(roots["scene"], roots["launch"], t1, tolerance, (Scene, Launch), LISTS)
     return roots, grid
