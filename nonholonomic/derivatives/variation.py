@@ -349,24 +349,23 @@ class FramedProblem(AbstractDerivedProblem):
 
     - `problem`: a problem.
     - `states`: the problem's state and the tangents of every cell, in turn.
-    - `magnitudes`: magnitudes of the problem's own components.
     - `begin`: the time of the problem [s] at the start.
     """
 
     problem: AbstractProblem
     states: Float[Array, "all *cells"]
-    magnitudes: Float[Array, "components *cells"]
     begin: Float[Array, ""]
 
     ends_on_event = False
 
     def start(self) -> tuple[Float[Array, "all *cells"], Float[Array, "all *cells"]]:
-        return self.states, jnp.concatenate([self.magnitudes] * (len(self.states) // len(self.magnitudes)))
+        magnitudes = self.problem.start()[1]
+        return self.states, jnp.concatenate([magnitudes] * (len(self.states) // len(magnitudes)))
 
     def field(self, time: Lanes, state: States) -> States:
-        time, size = self.clock(time), len(self.magnitudes)
-        point, *tangents = (state[k : k + size] for k in range(0, len(state), size))
-        rate, carried = jax.linearize(lambda point: self.problem.field(time, point), jnp.asarray(point))
+        time, size = self.clock(time), len(self.problem.start()[0])
+        point, *tangents = jnp.split(jnp.asarray(state), len(state) // size)
+        rate, carried = jax.linearize(lambda point: self.problem.field(time, point), point)
         return jnp.concatenate([rate, *map(carried, tangents)])
 
     def clock(self, time: Lanes) -> Lanes:
@@ -385,7 +384,7 @@ def probed(problem: AbstractProblem) -> FramedProblem:
     direction = jnp.cos(1.0 + jnp.arange(len(start)))
     direction = jnp.broadcast_to(direction.reshape(-1, *(1,) * (start.ndim - 1)), start.shape)
     tangent = magnitudes * direction / jnp.linalg.norm(direction, axis=0)
-    return FramedProblem(problem, jnp.concatenate([start, tangent]), magnitudes, jnp.zeros(()))
+    return FramedProblem(problem, jnp.concatenate([start, tangent]), jnp.zeros(()))
 
 
 #: Tangents are orthonormalised before one grows or shrinks by more than e to this power: so much of their digits is lost.
@@ -495,7 +494,7 @@ def growth(
     def advance(
         states: Array, begin: float, duration: float
     ) -> tuple[Float[Array, "tangents cells"], Float[Array, "all cells"], Outcome]:
-        framed = FramedProblem(problem, states, magnitudes, jnp.asarray(begin))
+        framed = FramedProblem(problem, states, jnp.asarray(begin))
         outcome, _ = solve_ensemble(framed, jnp.asarray(duration), jnp.asarray(cells), settings)
         logarithm, states = _with_unit_tangents(jnp.asarray(outcome.state), magnitudes)
         return logarithm, states, outcome._replace(state=outcome.state[:size])
