@@ -9,6 +9,7 @@ from never_run import density_of_a_film, run_of_nothing, small_table
 
 import nonholonomic
 from nonholonomic.identification import sample
+from nonholonomic.runs.trajectory import explore_model
 
 pytestmark = pytest.mark.oldest
 
@@ -23,6 +24,7 @@ OPTIONAL = {
     "a plot of a run": (lambda: run_of_nothing().plot(), "matplotlib", "plot"),
     "a film": (lambda: run_of_nothing().animate("a.webm"), "jupyter_threejs_sage", "view"),
     "a page": (lambda: run_of_nothing().view(), "jupyter_threejs_sage", "view"),
+    "a page with sliders": (lambda: explore_model(None, None, None, 1.0, None, None), "jupyter_threejs_sage", "view"),
     "draws": (lambda: sample(density_of_a_film()[0], None, None), "blackjax", "bayes"),
 }
 

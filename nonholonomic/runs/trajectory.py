@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .. import views
+from .. import validation, views
 from ..compilation.tracing import named_errors
 from ..hybrid import MOST_ROUNDS, HybridOutcome, hybrid_resets
 from ..hybrid.ensemble import OnlyMode
@@ -121,6 +121,7 @@ def drawn_by(model: Any, draw: Draw) -> Any:
 
 def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: float, unit: Unit, label: Any) -> Page:
     """The page of a model. **Arguments:** as for `explore`."""
+    validation.require_package("jupyter_threejs_sage", "view", "explore")
     if path is not None:
         require_file(path, "path", ".html", ".htm")
     require_all(run_bounds(t1, 1e-9))

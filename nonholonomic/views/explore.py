@@ -615,8 +615,7 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "", 
     **Arguments:** `stage`: a stage with one run, for its arena, meshes and names; `speed`, `below`: as for `page`; `unit`: that
     of curves, arrows and sliders, as for `in_unit`.
 
-    **Raises:** `ModuleNotFoundError` if the library for views is not installed; `ValueError` for equations that cannot be
-    written in JavaScript.
+    **Raises:** `ValueError` for equations that cannot be written in JavaScript.
     """
     # The title and the warnings describe one run, but the sliders change the run.
     stage_of_live = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))

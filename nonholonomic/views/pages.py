@@ -96,13 +96,9 @@ def page(
     - `height`: height of each stage in pixels.
     - `scripts`: HTML of additional scripts, such as `script` returns, inserted after those of the page.
     - `autoplay`: whether the page plays once when it first becomes visible.
-
-    **Raises:** `ModuleNotFoundError` if there are stages and jupyter-threejs-sage is not installed.
     """
     parts = {"TITLE": html.escape(title), "HEIGHT": str(height), "ABOVE": above, "BELOW": below, "VIEW": ""}
     if stages:
-        if without_motion():
-            raise ModuleNotFoundError("a view needs three.js: pip install 'nonholonomic[view]'")
         numbers = _Numbers()
         facts = {
             "speed": speed,
