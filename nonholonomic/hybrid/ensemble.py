@@ -293,18 +293,31 @@ def at_start(
 
 def advanced(advance: Advance, numbers: Sequence[int], carry: Carry, mask: Bool[Numbers, " cells"]) -> Carry:
     """The carry, whose arrays have the cells last, after the masked cells have advanced, if there are any."""
-    xp = mask.__array_namespace__()
+    if isinstance(mask, np.ndarray):
+        selected = np.flatnonzero(mask)
+        if not selected.size:
+            return carry
+        # The first of them is the padding: in other modes, the components of the state may mean something else.
+        cell = np.full(mask.size, selected[0])
+        cell[: selected.size] = selected
+        new = advance(numbers, cell, np.asarray(selected.size), of_cells(carry, cell))
+
+        def placed(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+            values = old.copy()
+            values[..., selected] = new[..., : selected.size]
+            return values
+
+        return jax.tree.map(placed, carry, new)
 
     def of_masked() -> Carry:
-        count, place = xp.sum(mask), xp.maximum(xp.cumsum(mask) - 1, 0)
-        # The first masked cell is the padding: in other modes, the components of the state may mean something else.
-        cell = xp.argsort(~mask, stable=True)
-        cell = xp.where(xp.arange(mask.size) < count, cell, cell[0])
+        if mask.size == 1:
+            return advance(numbers, jnp.zeros(1, int), jnp.ones((), int), carry)
+        count, place = jnp.sum(mask), jnp.maximum(jnp.cumsum(mask) - 1, 0)
+        cell = jnp.argsort(~mask, stable=True)
+        cell = jnp.where(jnp.arange(mask.size) < count, cell, cell[0])
         new = advance(numbers, cell, count, of_cells(carry, cell))
-        return jax.tree.map(lambda old, new: xp.where(mask, new[..., place], old), carry, new)
+        return jax.tree.map(lambda old, new: jnp.where(mask, new[..., place], old), carry, new)
 
-    if xp is np:
-        return of_masked() if mask.any() else carry
     return jax.lax.cond(jnp.any(mask), of_masked, lambda: carry)
 
 
