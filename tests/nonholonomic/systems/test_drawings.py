@@ -184,9 +184,12 @@ def test_what_a_drawing_lacks_is_said_in_pages_with_sliders():
 
 def test_runs_side_by_side_are_all_drawn_by_the_function():
     runs = [simulate(Pendulum(length), ([1.0], [0.0]), 0.5) for length in (1.0, 2.0)]
-    stages = runs[0]._stages([runs[1]], False, None, pendulum, None)
-    assert [stage.title for stage in stages] == ["Pendulum", "Pendulum"]
-    assert [len(stage.shows[0].arrows) for stage in stages] == [1, 1]
+    alone, together = (runs[0].view(others=others, draw=pendulum).html for others in ([], runs[1:]))
+    # The meshes of the balls.
+    assert together.count('"vertices"') == 2 * alone.count('"vertices"') > 2
+    assert [stage.title for stage in runs[0].drawn_by(pendulum).stages([runs[1].drawn_by(pendulum)])] == 2 * [
+        "Pendulum"
+    ]
 
 
 def test_a_batch_of_runs_is_refused_also_with_a_drawing():
