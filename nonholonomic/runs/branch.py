@@ -155,9 +155,9 @@ class Orbit(eqx.Module):
             require(step, "step", above=0.0)
         course, full = continuation_of(self, name, until, period)
         largest = 1.0 / STEPS if step is None else min(float(step) / abs(course.last - course.first), 0.5)
-        found, kinds, end = course.followed(largest, points)
-        values = jnp.asarray([point.value for point in found])
-        orbits = jax.tree.map(lambda *parts: jnp.asarray(np.stack(parts)), *(point.orbit for point in found))
+        visited, kinds, end = course.followed(largest, points)
+        values = jnp.asarray([point.value for point in visited])
+        orbits = jax.tree.map(lambda *parts: jnp.asarray(np.stack(parts)), *(point.orbit for point in visited))
         return Branch(full, values, orbits, tuple(kinds), end, period)
 
     def __repr__(self) -> str:

@@ -215,8 +215,8 @@ def launches(
     # A launch with entries for all given numbers.
     sizes = {name: len(parts) for name, parts in SEVERAL.items()}
     sizes["place"] = 3 if "launch.place[2]" in values else len(scene.surface.coordinates)
-    given = {number.partition("[")[0] for number in values}
-    vectors = {name: (0.0,) * size for name, size in sizes.items() if f"launch.{name}" in given}
+    unindexed = {number.partition("[")[0] for number in values}
+    vectors = {name: (0.0,) * size for name, size in sizes.items() if f"launch.{name}" in unindexed}
     roots = with_numbers({"launch": Launch(0.0, 0.0, **vectors), "scene": scene}, scalars)
     roots["launch"].stated_in(unit_of(stated))
     names = TopModel(**roots).label(list(values), taken)
