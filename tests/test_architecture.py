@@ -39,7 +39,7 @@ MOST_LINES = 450
 MOST_FILES_OUTSIDE = 6
 
 #: The size of the three packages: it may shrink. Imports are a share of the lines of code.
-MOST = {"files": 112, "lines": 25_452, "functions": 2550, "Any": 486, "imports": 0.0850}
+MOST = {"files": 112, "lines": 25_467, "functions": 2552, "Any": 486, "imports": 0.0850}
 
 
 class Arrow(NamedTuple):

@@ -342,6 +342,47 @@ def in_groups(run: Callable[..., tuple[PyTree, list[PyTree]]], tangents: Tangent
 # al., Meccanica 15 (1980) 9). Tangents and lengths are those of the state in units of the problem's magnitudes.
 
 
+class VariedProblem(AbstractDerivedProblem):
+    """A problem without its event, extended by a tangent of length 1, w' = J w - g w with g = (w . J w) / (w . w), and the
+    logarithm of its growth, the integral of g.
+
+    **Arguments:**
+
+    - `problem`: a problem.
+    - `states`: the problem's state, the tangent and the growth of every cell.
+    """
+
+    problem: AbstractProblem
+    states: Float[Array, "twice_components_and_one *cells"]
+
+    ends_on_event = False
+
+    def start(self) -> tuple[Float[Array, "all *cells"], Float[Array, "all *cells"]]:
+        magnitudes = self.problem.start()[1]
+        unit_scales = jnp.ones((len(self.states) - len(magnitudes), *self.states.shape[1:]))
+        return self.states, jnp.concatenate([magnitudes, unit_scales])
+
+    def field(self, time: Lanes, state: States) -> States:
+        magnitudes = self.problem.start()[1]
+        y, w = self.inner(state), state[len(magnitudes) : -1]
+        rate, carried = jax.jvp(lambda point: self.problem.field(time, point), (y,), (w * magnitudes,))
+        carried = carried / magnitudes
+        growth = jnp.sum(w * carried, axis=0) / jnp.sum(w * w, axis=0)
+        return jnp.concatenate([rate, carried - growth * w, growth[None]])
+
+
+def probed(problem: AbstractProblem) -> VariedProblem:
+    """A run and a generic tangent, for derivatives that do not take part in step-size control. The generic tangent does
+    take part, so that the steps suit tangents even where the state is at rest. It keeps its length: one that decays would
+    soon be smaller than its tolerance.
+    """
+    start, _ = problem.start()
+    direction = jnp.cos(1.0 + jnp.arange(len(start)))
+    direction = jnp.broadcast_to(direction.reshape(-1, *(1,) * (start.ndim - 1)), start.shape)
+    unit = direction / jnp.linalg.norm(direction, axis=0)
+    return VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, *start.shape[1:]))]))
+
+
 class FramedProblem(AbstractDerivedProblem):
     """A problem without its event, extended by tangents.
 
@@ -374,17 +415,6 @@ class FramedProblem(AbstractDerivedProblem):
     def jumps(self, time: Lanes, state: States) -> Jumps | None:
         jumps = super().jumps(time, state)
         return None if jumps is None else jumps._replace(times=jumps.times - self.begin)
-
-
-def probed(problem: AbstractProblem) -> FramedProblem:
-    """A run and a generic tangent, for derivatives that do not take part in step-size control. The generic tangent does
-    take part, so that the steps suit tangents even where the state is at rest.
-    """
-    start, magnitudes = problem.start()
-    direction = jnp.cos(1.0 + jnp.arange(len(start)))
-    direction = jnp.broadcast_to(direction.reshape(-1, *(1,) * (start.ndim - 1)), start.shape)
-    tangent = magnitudes * direction / jnp.linalg.norm(direction, axis=0)
-    return FramedProblem(problem, jnp.concatenate([start, tangent]), jnp.zeros(()))
 
 
 #: Tangents are orthonormalised before one grows or shrinks by more than e to this power: so much of their digits is lost.

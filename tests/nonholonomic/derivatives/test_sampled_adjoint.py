@@ -1,5 +1,6 @@
 """Derivatives of sampled runs by one backward pass, against a closed form, in every composition of transformations."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -138,3 +139,41 @@ def test_an_infinite_cotangent_of_a_number_at_rest_has_no_effect():
 
     gradients = jax.jit(jax.vmap(jax.grad(root)))(jnp.array([[1.0, 0.5, 9.0], [1.0, 0.5, 1.9]]))
     assert_close(gradients, [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], atol=1e-12)
+
+
+class DampedOscillator(AbstractProblem):
+    """y'' = -damping y' - 25 y from y = height, at rest for height 0."""
+
+    height: jax.Array
+    damping: float
+
+    def start(self):
+        return jnp.stack([self.height, 0.0 * self.height]), jnp.ones(2)
+
+    def field(self, time, state):
+        return jnp.stack([state[1], -self.damping * state[1] - 25.0 * state[0]])
+
+    def event_function(self, state):
+        return None
+
+    def domain_margin(self, time, state):
+        return None
+
+
+def build_oscillator(numbers, cells):
+    return DampedOscillator(*numbers)
+
+
+@pytest.mark.parametrize(("damping", "end"), [(1.0, 40.0), (-0.5, 20.0)])
+def test_diffrax_differentiates_a_motion_at_rest_however_much_its_tangent_decays_or_grows(damping, end):
+    """A generic tangent of constant length keeps the steps short: the derivative of the height at the end is 1e-9, or 122."""
+
+    def height_at_end(height):
+        times, backward = jnp.array([0.5 * end, end]), diffrax.RecursiveCheckpointAdjoint()
+        options = (times, jnp.asarray(end), Settings(1e-6))
+        return sampled_run(build_oscillator, (height, damping), *options, adjoint=backward).states[-1, 0]
+
+    frequency = np.sqrt(25.0 - 0.25 * damping**2)
+    phase = frequency * end
+    exact = np.exp(-0.5 * damping * end) * (np.cos(phase) + 0.5 * damping / frequency * np.sin(phase))
+    assert_close(jax.grad(height_at_end)(0.0), exact, rtol=1e-7)
