@@ -117,6 +117,10 @@ class AbstractBatchedMode(eqx.Module):
         raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
 
 
+#: The modes of a system, by their index.
+Modes = tuple[AbstractBatchedMode, ...]
+
+
 class StartedProblem(CoreProblem):
     """The leading components of a problem, which may be all, from other states."""
 
@@ -436,7 +440,7 @@ _reset_alone = compiled_quickly(reset_of_cells)
 
 
 def solve_hybrid(
-    modes: tuple[AbstractBatchedMode, ...],
+    modes: Modes,
     mode: Int[Numbers, " cells"],
     state: Float[Numbers, "components cells"],
     t1: float | Float[Numbers, "*cells"],
@@ -499,12 +503,7 @@ def solve_hybrid(
 
 
 def _advances(
-    modes: tuple[AbstractBatchedMode, ...],
-    t1: Float[Numbers, " cells"],
-    settings: Settings,
-    *,
-    traced: bool = False,
-    **options: Any,
+    modes: Modes, t1: Float[Numbers, " cells"], settings: Settings, *, traced: bool = False, **options: Any
 ) -> tuple[Advance, Advance]:
     """Advance cells through a mode, and through its reset map. **Arguments:** as for `solve_hybrid`; `options`: of
     `solve_ensemble`."""
@@ -527,13 +526,7 @@ def _advances(
 
 
 def hybrid_resets(
-    modes: tuple[AbstractBatchedMode, ...],
-    number: int,
-    state: Float[np.ndarray, " components"],
-    t1: float,
-    settings: Settings,
-    *,
-    counters: int,
+    modes: Modes, number: int, state: Float[np.ndarray, " components"], t1: float, settings: Settings, *, counters: int
 ) -> list[tuple[HybridOutcome[np.ndarray], HybridOutcome[np.ndarray]]]:
     """The run of one cell before and after each of its resets.
 
@@ -676,7 +669,7 @@ _between = eqx.filter_jit(lambda mode, motion, elapsed: mode.between(motion, ela
 
 
 def solve_hybrid_dense(
-    modes: tuple[AbstractBatchedMode, ...],
+    modes: Modes,
     number: int,
     state: Float[Array | np.ndarray, " components"],
     t1: float,

@@ -31,7 +31,7 @@ from ..derivatives.variation import delay, where_active
 from ..integration import AbstractPassive, AbstractProblem, ExtendedProblem, Lanes, Settings, States
 from ..integration.problem import CROSSED, REACHED_END
 from ..integration.scheduler import Numbers
-from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
+from .ensemble import AbstractBatchedMode, HybridOutcome, Modes, Transition, solve_hybrid
 
 #: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance
 #: allows, changes its rate by more than this fraction. The relative error of the derivative is then about as large.
@@ -237,11 +237,7 @@ def along(
 
 
 def with_variations(
-    modes: tuple[AbstractBatchedMode, ...],
-    state: States,
-    tangents: Tangents,
-    tolerance: Float[Array, ""],
-    ends_on_event: bool,
+    modes: Modes, state: States, tangents: Tangents, tolerance: Float[Array, ""], ends_on_event: bool
 ) -> tuple[tuple[VariationalMode, ...], Float[Array, "variational *lanes"]]:
     """The modes with their variations, and the initial states with their clocks, followed by the variations of both.
 
@@ -269,7 +265,7 @@ class Slopes(NamedTuple, Generic[Numbers]):
 
 
 def solve_hybrid_with_tangents(
-    modes: tuple[AbstractBatchedMode, ...],
+    modes: Modes,
     tangents: Tangents,
     mode: Int[Numbers, " cells"],
     state: Float[Numbers, "components cells"],

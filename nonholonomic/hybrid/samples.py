@@ -21,6 +21,7 @@ from .ensemble import (
     Advance,
     Carry,
     HybridOutcome,
+    Modes,
     Transition,
     TransitionPath,
     after_reset,
@@ -35,7 +36,7 @@ from .ensemble import (
 from .saltation import Tangents, VariationalMode, with_variations
 
 #: The modes, the index of the first mode of every cell, and the initial states.
-Built = tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"], States]
+Built = tuple[Modes, Int[Array, " cells"], States]
 
 # Output rows of runs between two modes, at given times, for many cells at once.
 
@@ -229,7 +230,7 @@ def output_rows(
 
 @compiled_alone
 def solve_hybrid_with_samples(
-    modes: tuple[AbstractBatchedMode, ...],
+    modes: Modes,
     mode: Int[Array, " cells"],
     state: States,
     times: Float[Array, "times *cells"],

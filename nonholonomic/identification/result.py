@@ -483,6 +483,10 @@ LEAST_ACCEPTED, LEAST_ESS = 0.02, 50.0
 FAR_BELOW = 10.0
 
 
+#: The coordinates of draws.
+Chains = Float[np.ndarray, "chains draws unknowns"]
+
+
 class Draws(NamedTuple):
     """Draws from a posterior.
 
@@ -502,7 +506,7 @@ class Draws(NamedTuple):
     """
 
     values: dict[str, Float[np.ndarray, "chains draws"]]
-    coordinates: Float[np.ndarray, "chains draws unknowns"]
+    coordinates: Chains
     r_hat: dict[str, float]
     ess: dict[str, float]
     accepted: float
@@ -517,14 +521,7 @@ class Draws(NamedTuple):
         return not self.flaws
 
     @classmethod
-    def of(
-        cls,
-        density: LogDensity,
-        coordinates: Float[np.ndarray, "chains draws unknowns"],
-        accepted: float,
-        runs: int,
-        excess: float = 0.0,
-    ) -> "Draws":
+    def of(cls, density: LogDensity, coordinates: Chains, accepted: float, runs: int, excess: float = 0.0) -> "Draws":
         """Draws at given coordinates, with diagnostics. **Arguments:** `excess`: of the log density at the start over the
         median of the draws."""
         values = ByName((name, np.asarray(value)) for name, value in density.values(jnp.asarray(coordinates)).items())
@@ -629,7 +626,7 @@ def sample(
 
 def drawn(
     density: LogDensity, known: Mixture | None, sizes: tuple[int, int, int], seed: int
-) -> tuple[Float[np.ndarray, "chains draws unknowns"], float, int, float]:
+) -> tuple[Chains, float, int, float]:
     """Coordinates of draws, the fraction of accepted proposals, the number of runs, and the excess of the log density at the
     start over the median of the draws.
 

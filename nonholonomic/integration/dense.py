@@ -261,23 +261,22 @@ def saved(solution: diffrax.Solution) -> tuple[PyTree, PyTree]:
     return solution.ts, solution.ys
 
 
+#: A state, and the magnitudes that scale its errors.
+Start = tuple[Float[Array, " components"], Float[Array, " components"]]
+
+
 @eqx.filter_jit
-def _start(
-    problem: AbstractProblem, time: Float[Array, ""]
-) -> tuple[Float[Array, " components"], Float[Array, " components"], Float[Array, ""] | None]:
+def _start(problem: AbstractProblem, time: Float[Array, ""]) -> tuple[Start, Float[Array, ""] | None]:
     """State, scales and domain margin at the start: one program, where JAX would compile each of their operations."""
     state, scales = problem.start()
-    return jnp.asarray(state), jnp.asarray(scales), problem.margin_at_start(time, state)
+    return (jnp.asarray(state), jnp.asarray(scales)), problem.margin_at_start(time, state)
 
 
 def _control(
-    problem: AbstractProblem,
-    settings: Settings,
-    state: Float[Array, " components"],
-    scales: Float[Array, " components"],
-    times: Float[Array, " times"] | None = None,
+    problem: AbstractProblem, settings: Settings, start: Start, times: Float[Array, " times"] | None = None
 ) -> diffrax.AbstractStepSizeController:
     """Step-size control whose steps end on given times and on both sides of each jump."""
+    state, scales = start
     # The largest error counts, not the mean: passive cyclic coordinates must not dilute the errors of the others.
     atol = settings.absolute * settings.tolerance * jax.lax.stop_gradient(scales)
     controller = diffrax.PIDController(settings.tolerance, atol, norm=optimistix.max_norm)
@@ -293,7 +292,7 @@ def _control(
 def _solved(
     problem: AbstractProblem,
     solver: diffrax.AbstractSolver,
-    times: tuple[Float[Array, ""] | float, Float[Array, ""] | float, Float[Array, ""] | None],
+    times: tuple[Array | None, ...],
     state: Float[Array, " components"],
     control: diffrax.AbstractStepSizeController,
     **options: PyTree,
@@ -311,24 +310,20 @@ def _solved(
 
 @eqx.filter_jit
 def _piece(
-    problem: AbstractProblem,
-    t0: Float[Array, ""],
-    t1: Float[Array, ""],
-    first: Float[Array, ""],
-    state: Float[Array, " components"],
-    scales: Float[Array, " components"],
-    settings: Settings,
-    dense: bool,
-    is_watched: bool,
+    problem: AbstractProblem, times: tuple[Array, ...], start: Start, settings: Settings, dense: bool, is_watched: bool
 ) -> tuple[diffrax.Solution, Float[Array, "steps 2"] | None]:
-    """Integrate as many steps as the settings allow; also bracket the first zero of the domain margin in each step."""
-    margin = eqx.filter_closure_convert(problem.margin_or_one, t0, state) if is_watched else None
+    """Integrate as many steps as the settings allow; also bracket the first zero of the domain margin in each step.
+
+    **Arguments:** `times`: as for `_solved`.
+    """
+    (begin, *_), (state, _) = times, start
+    margin = eqx.filter_closure_convert(problem.margin_or_one, begin, state) if is_watched else None
     solver = settings.for_single_runs if dense or is_watched else settings.for_steps_alone
     event = None if margin is None else diffrax.Event(lambda t, y, args, **_: margin(t, y) < 0.0)
     options = {"saveat": diffrax.SaveAt(t0=True, steps=True, dense=dense or is_watched), "event": event}
-    control = _control(problem, settings, state, scales)
-    solution = _solved(problem, solver, (t0, t1, first), state, control, max_steps=settings.max_steps, **options)
-    return solution, _first_losses(problem, solution, t0) if is_watched else None
+    control = _control(problem, settings, start)
+    solution = _solved(problem, solver, times, state, control, max_steps=settings.max_steps, **options)
+    return solution, _first_losses(problem, solution, begin) if is_watched else None
 
 
 def _first_losses(
@@ -385,16 +380,16 @@ def follow(
     [[0.367879 0.135335]]
     """
     time, end, length = jnp.asarray(0.0, float), jnp.asarray(t1, float), jnp.asarray(FIRST_STEP, float)
-    state, scales, margin = _start(problem, time)
+    (state, scales), margin = _start(problem, time)
+    is_watched = margin is not None
     times, states, segments = [np.zeros(1)], [np.asarray(state)[:, None]], []
     accepted, rejected, failed = 0, 0, False
     lost = margin is not None and float(margin) <= 0.0
     # The program is compiled for this number of steps, so it must not change with the number that is left.
     piece_settings = dataclasses.replace(settings, max_steps=min(piece, settings.max_steps))
     while float(time) < t1 and not (lost or failed):
-        solution, brackets = _piece(
-            problem, time, end, length, state, scales, piece_settings, dense, margin is not None
-        )
+        start = state, scales
+        solution, brackets = _piece(problem, (time, end, length), start, piece_settings, dense, is_watched)
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
         ts, ys = saved(solution)
@@ -467,7 +462,7 @@ def sample(
     grid: Float[Array, " steps"] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     ends_on_event: bool = False,
-    start: tuple[Float[Array, " components"], Float[Array, " components"]] | None = None,
+    start: Start | None = None,
 ) -> tuple[Outcome, Float[Array, "components times"]]:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
@@ -504,7 +499,8 @@ def sample(
         times, save_at, max_points = grid, diffrax.SubSaveAt(t0=True, steps=True), grid.size - 1
     else:
         save_at, max_points = diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), settings.max_steps
-    control = _control(problem, settings, state, scales, jnp.minimum(times, t1)) if grid is None else _GivenSteps(grid)
+    start = state, scales
+    control = _control(problem, settings, start, jnp.minimum(times, t1)) if grid is None else _GivenSteps(grid)
     solver = settings.for_single_runs if conditions else settings.for_steps_alone
     options = {"max_steps": max_points, "event": event if conditions else None}
     options |= {"saveat": diffrax.SaveAt(subs=[save_at, diffrax.SubSaveAt(t1=True)])}

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from ..derivatives import exponent_of, growth
 from ..derivatives.variation import in_stretches, orthonormalised
-from ..hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
+from ..hybrid import HybridOutcome, solve_hybrid
+from ..hybrid.ensemble import Modes
 from ..hybrid.saltation import with_variations
 from ..integration import Outcome, Settings
 from ..integration.problem import DEFAULT_MAX_STEPS, Status
@@ -352,10 +353,7 @@ def _through_modes(
 
 @eqx.filter_jit
 def _rescaled(
-    modes: tuple[AbstractBatchedMode, ...],
-    mode: Int[Array, " cells"],
-    state: Float[Array, "all cells"],
-    size: int,
+    modes: Modes, mode: Int[Array, " cells"], state: Float[Array, "all cells"], size: int
 ) -> tuple[Float[Array, "tangents cells"], Float[Array, "all cells"]]:
     """The logarithms of the growth of tangents in units of the magnitudes of the mode, and the states with tangents of length 1
     and clocks at zero."""

@@ -116,27 +116,6 @@ def turned(vector: Vector, axis: Vector, angle: Float[Array, "..."]) -> Vector:
     return sum_vectors(parallel, scale(jnp.cos(angle), perpendicular), scale(jnp.sin(angle), binormal))
 
 
-def _descent(
-    body: Top,
-    gravity: Float[Array, "..."],
-    ball: Ball,
-    free: FreeBody,
-    at_rest: Bool[Array, " cells"],
-    is_touching: Bool[Array, " cells"],
-) -> Descent:
-    """The distance of a sphere from the plane in flight."""
-    motion = cone(body, free)
-    start = jnp.where(is_touching, 0.0, greatest(free.gap(ball), 0.0))
-    speed = free.gap_rate(body, ball)
-    speed = jnp.where(at_rest, 0.0, jnp.where(is_touching, greatest(speed, 0.0), speed))
-    cosine, sine = ball.offset * motion.perpendicular[2], ball.offset * motion.binormal[2]
-    # Where the normal force vanishes, the distance has no curvature: the remainder is round-off, and may only rise.
-    upper_bound = -gravity / jnp.maximum(motion.rate**2, jnp.finfo(cosine.dtype).tiny)
-    cosine = jnp.where(at_rest, jnp.minimum(cosine, upper_bound), cosine)
-    gravity = jnp.broadcast_to(gravity, start.shape)
-    return Descent(start, speed, gravity, motion.rate, cosine, sine)
-
-
 def landing(descent: Descent, max_time: Lanes) -> tuple[Lanes, Bool[Array, " cells"]]:
     """Time at which the distance first falls below zero, after a start at zero or above.
 
@@ -259,11 +238,22 @@ def take_flight(
     **Returns:** the top at the end of the flight; and whether a sphere has reached the plane.
     """
     body, gravity, free = scene.body, scene.gravity, air.free
+    motion = cone(body, free)
     max_time = greatest(left - air.elapsed, 0.0)
     times, speeds, has_failed = [], [], jnp.zeros(max_time.shape, bool)
     for number, ball in enumerate(balls(body)):
-        # A sphere that was at rest when the normal force vanished rises with the third power of time.
-        descent = _descent(body, gravity, ball, free, (air.ball == number) & ~air.rising, air.ball == number)
+        # The distance of the sphere from the plane. A sphere that was at rest when the normal force vanished rises with the
+        # third power of time.
+        is_touching = air.ball == number
+        at_rest = is_touching & ~air.rising
+        start = jnp.where(is_touching, 0.0, greatest(free.gap(ball), 0.0))
+        speed = free.gap_rate(body, ball)
+        speed = jnp.where(at_rest, 0.0, jnp.where(is_touching, greatest(speed, 0.0), speed))
+        cosine, sine = ball.offset * motion.perpendicular[2], ball.offset * motion.binormal[2]
+        # Where the normal force vanishes, the distance has no curvature: the remainder is round-off, and may only rise.
+        upper_bound = -gravity / jnp.maximum(motion.rate**2, jnp.finfo(cosine.dtype).tiny)
+        cosine = jnp.where(at_rest, jnp.minimum(cosine, upper_bound), cosine)
+        descent = Descent(start, speed, jnp.broadcast_to(gravity, start.shape), motion.rate, cosine, sine)
         # The search is by bisection, which has no derivative.
         time, given_up = landing(*stop_gradient((descent, max_time)))
         # The derivatives of the time are those of an implicit function.
