@@ -29,6 +29,9 @@ from ..validation import is_traced
 #: The primal output of a solve: arrays of floats, the cells along the first axis.
 Primal: TypeAlias = PyTree
 
+#: Numbers of a solve, each a scalar or an array.
+Leaves: TypeAlias = tuple[Float[Array, "..."], ...]
+
 #: JAX's PyTreeDef, which type checkers take for a variable.
 Structure: TypeAlias = Any
 
@@ -77,7 +80,7 @@ class AbstractDifferentiableSolve(AbstractSolve):
         be differentiated again, in forward mode; `cells`, `leaves`: as for `solve`.
         """
 
-    def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Float[Array, "..."], ...]) -> bool:
+    def prefers_adjoint(self, active: tuple[int, ...], leaves: Leaves) -> bool:
         """Whether `push_forward` and `pull_back` take the place of the derivatives with respect to every active leaf;
         by default they do not. **Arguments:** as for `value_and_tangents`, for a single run."""
         return False
@@ -86,18 +89,12 @@ class AbstractDifferentiableSolve(AbstractSolve):
         """The primal with `None` for parts that are not differentiable."""
         return primal
 
-    def push_forward(
-        self,
-        active: tuple[int, ...],
-        cells: int,
-        leaves: tuple[Float[Array, "..."], ...],
-        tangents: tuple[Float[Array, "..."], ...],
-    ) -> Primal:
+    def push_forward(self, active: tuple[int, ...], cells: int, leaves: Leaves, tangents: Leaves) -> Primal:
         """The tangent of the primal along tangents of the active leaves, which may be the same for all cells."""
         raise NotImplementedError
 
     def pull_back(
-        self, active: tuple[int, ...], cells: int, leaves: tuple[Float[Array, "..."], ...], cotangents: Primal
+        self, active: tuple[int, ...], cells: int, leaves: Leaves, cotangents: Primal
     ) -> list[Float[Array, "cells ..."]]:
         """The cotangents of the active leaves in every cell, from those of the primal, `None` for parts without one."""
         raise NotImplementedError

@@ -279,11 +279,7 @@ def place_named(surface: AbstractSurface, place: Place) -> Place:
 
 
 def frame_of(
-    surface: AbstractSurface,
-    side: float,
-    distance: Float[Array, "..."],
-    pull: Float[Array, "..."],
-    carried: bool = False,
+    surface: AbstractSurface, side: float, distance: Component, pull: Component, carried: bool = False
 ) -> AbstractFrame:
     """The frame of a ball on a surface: the surface's own if it has one, else a `CarriedFrame`.
 

@@ -26,6 +26,7 @@ from ..derivatives.sampled_runs import AbstractSampling, Options, solve_for_samp
 from ..derivatives.variation import Tangent, by_active, where_active, with_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
+from ..integration.samples import Times
 from ..integration.scheduler import of_cells
 from .ensemble import (
     BETWEEN,
@@ -54,12 +55,7 @@ MOST_FORWARD_ALONE = 32
 
 
 def hybrid_samples(
-    build: Build,
-    modules: PyTree,
-    times: Float[Array, " times"],
-    t1: Float[Array, ""],
-    settings: Settings,
-    counters: int,
+    build: Build, modules: PyTree, times: Times, t1: Float[Array, ""], settings: Settings, counters: int
 ) -> SampledRun:
     """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in
     step-size control. A batch under `vmap` is solved as one ensemble. The gradient of a function of its samples by many

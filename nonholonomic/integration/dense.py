@@ -292,7 +292,7 @@ def _control(
 def _solved(
     problem: AbstractProblem,
     solver: diffrax.AbstractSolver,
-    times: tuple[Array | None, ...],
+    times: tuple[Array, Array, Array | None],
     state: Float[Array, " components"],
     control: diffrax.AbstractStepSizeController,
     **options: PyTree,
@@ -310,7 +310,12 @@ def _solved(
 
 @eqx.filter_jit
 def _piece(
-    problem: AbstractProblem, times: tuple[Array, ...], start: Start, settings: Settings, dense: bool, is_watched: bool
+    problem: AbstractProblem,
+    times: tuple[Array, Array, Array],
+    start: Start,
+    settings: Settings,
+    dense: bool,
+    is_watched: bool,
 ) -> tuple[diffrax.Solution, Float[Array, "steps 2"] | None]:
     """Integrate as many steps as the settings allow; also bracket the first zero of the domain margin in each step.
 

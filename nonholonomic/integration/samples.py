@@ -23,6 +23,9 @@ from .step import LaneState, after_step, trial_step, until_jump
 
 # The times at which the cells of a problem are sampled, and the samples so far.
 
+#: The times of one run [s].
+Times = Float[Array, " times"]
+
 #: The values to keep of some states: (the cells in the lanes, (rows, components, lanes)) -> a tree of arrays
 #: (rows, lanes, ...).
 Read = Callable[[Integers, Float[Array, "rows components *lanes"]], PyTree]

@@ -16,6 +16,7 @@ from ..derivatives import SampledRun, sampled_run
 from ..hybrid import HybridOutcome, hybrid_samples, solve_hybrid_with_samples
 from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
 from ..integration.problem import Status, legal_run, require_times
+from ..integration.samples import Times
 from ..integration.scheduler import of_cells
 from ..sweeps import Axis, Variable
 from ..terminal import status_line
@@ -64,7 +65,7 @@ class Samples:
         names, times = self.names, jnp.asarray(self.times, float)
         horizon = (jnp.asarray(t1, float), jnp.asarray(count), settings)
         if cells.smooth:
-            outcome, status, values = _followed(problem_of(cells, size, names), cells, names, times, *horizon)
+            outcome, status, values = _followed(problem_of(cells, size, names), cells, names, times, horizon)
             values |= counted(cells, outcome)
         else:
             start, counters = modes_of(cells, size, settings.tolerance, names), len(cells.counters)
@@ -76,13 +77,7 @@ class Samples:
 # Compiled on its own, not inside other transformed functions; otherwise it does not get the compiler's options.
 @compiled_alone
 def _followed(
-    problem: Any,
-    cells: AbstractModel,
-    names: tuple[str, ...],
-    times: Float[Array, " times"],
-    t1: Float[Array, ""],
-    count: Int[Array, ""],
-    settings: Settings,
+    problem: Any, cells: AbstractModel, names: tuple[str, ...], times: Times, horizon: tuple[Array, Array, Settings]
 ) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
     """The outcome of the runs, their `Status`, and the named quantities at the samples."""
 
@@ -95,8 +90,8 @@ def _followed(
         )(of_lanes, states)
 
     options: Any = {"one_kernel": True, "read": read, "dense": len(times) >= DENSE}
-    outcome, samples = solve_with_samples(problem, times, t1, count, settings, **options)
-    return outcome, cells.ended(outcome, settings.tolerance), samples
+    outcome, samples = solve_with_samples(problem, times, *horizon, **options)
+    return outcome, cells.ended(outcome, horizon[-1].tolerance), samples
 
 
 def own_axis(leaf: Any) -> int | None:
@@ -136,11 +131,7 @@ def outcome_of(samples: SampledRun) -> HybridOutcome[Array]:
 
 @eqx.filter_jit
 def _read_samples(
-    cells: AbstractModel,
-    names: tuple[str, ...],
-    times: Float[Array, " times"],
-    samples: SampledRun,
-    tolerance: Float[Array, ""],
+    cells: AbstractModel, names: tuple[str, ...], times: Times, samples: SampledRun, tolerance: Float[Array, ""]
 ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
     """The `Status` of runs of several modes, and the variables of the table."""
 
@@ -276,7 +267,7 @@ class SampledRows(eqx.Module):
 def sampled(
     model: AbstractModel,
     names: Names,
-    times: Float[Array, " times"],
+    times: Times,
     t1: Float[Array, ""],
     settings: Settings,
     grid: Float[Array, " steps"] | None = None,
@@ -303,7 +294,7 @@ def sampled(
 
 def sampled_if_legal(
     model: AbstractModel,
-    times: Float[Array, " times"],
+    times: Times,
     t1: Float[Array, ""],
     settings: Settings,
     grid: Float[Array, " steps"] | None = None,

@@ -32,6 +32,9 @@ from .input import Input, Motion
 
 State = Float[Array, "components ..."]
 
+#: A number, or one for each of several states.
+Numbers = Float[Array, "..."]
+
 # The body: a rigid frame on two rear wheels, with one front wheel in a fork that steers.
 
 #: The range of a wheelbase [m]; above 20 m, more than any vehicle's, it suggests millimetres or centimetres.
@@ -206,9 +209,9 @@ class Dynamics(eqx.Module):
         self,
         position: Vector,
         heading: Vector,
-        steering: Float[Array, "..."],
-        steering_rate: Float[Array, "..."],
-        wheel: Float[Array, "..."],
+        steering: Numbers,
+        steering_rate: Numbers,
+        wheel: Numbers,
         works: int = 0,
     ) -> State:
         """The state of a motion.

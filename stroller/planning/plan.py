@@ -19,7 +19,7 @@ from nonholonomic.views import DARK, Body, Mesh, Page, Stage, bar, page
 from nonholonomic.views.plot import draw_title, new_figure
 from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
-from ..model.dynamics import Dynamics, padded
+from ..model.dynamics import Dynamics, Numbers, padded
 from ..model.scene import Launch, Scene
 from ..runs.model import simulate
 from ..runs.trajectory import Trajectory
@@ -249,12 +249,8 @@ def checked_drive(problem: Problem, drive: Drive, tolerance: float) -> Plan:
 
 @eqx.filter_jit
 def seen_along(
-    dynamics: Dynamics,
-    footprint: Footprint,
-    drive: Drive,
-    times: Float[Array, " times"],
-    states: Float[Array, "times n"],
-) -> tuple[Corners, Float[Array, " times"], Float[Array, " times"]]:
+    dynamics: Dynamics, footprint: Footprint, drive: Drive, times: Numbers, states: Float[Array, "times n"]
+) -> tuple[Corners, Numbers, Numbers]:
     """The corners [m] of the footprint, the force [N] and the torque [N m] of a drive along a run."""
     corners = corners_of(dynamics, footprint, states.T[: 2 * dynamics.surface.axes])
     return corners, *drive(times, dynamics.geometry(states.T).motion)

@@ -18,10 +18,10 @@ from nonholonomic.terminal import Progress, status_line
 from nonholonomic.text import likely, shown
 from nonholonomic.validation import explaining, require, require_flag, require_kind, require_package, require_whole
 
-from ..model.dynamics import Dynamics, padded
+from ..model.dynamics import Dynamics, Numbers, padded
 from ..model.scene import Scene
 from .problem import FAR, FROM_ABOVE, SQUARE, Pose, checked_problem, frame_of
-from .transcription import ORDER, Numbers, Task, drive_from, motion_at, point_residuals, windows
+from .transcription import ORDER, Task, drive_from, motion_at, point_residuals, windows
 
 # A network that proposes drives, step by step: it sees the goal and the obstacles from where the stroller is.
 

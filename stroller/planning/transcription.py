@@ -20,13 +20,11 @@ from scipy.interpolate import make_interp_spline
 
 from nonholonomic.geometry import AbstractSurface, Vector, add, cross, difference, dot, multiply, scale, subtract
 
-from ..model.dynamics import Dynamics, padded
+from ..model.dynamics import Dynamics, Numbers, padded
 from ..model.input import Motion
 from .problem import LIMIT_RESERVE, Footprint, Obstacles, Pose, Problem, corners_of, frame_of
 
-#: Numbers in JAX; and coefficients of the splines of the steering angle and of the front wheel's speed, all or those of an
-#: interval.
-Numbers: TypeAlias = Float[Array, "..."]
+#: Coefficients of the splines of the steering angle and of the front wheel's speed, all or those of an interval.
 Splines: TypeAlias = Float[Array, "rows 2"]
 
 # Inverse dynamics: the force and the torque that move the stroller with a given speed and steering angle.
