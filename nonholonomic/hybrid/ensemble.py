@@ -268,6 +268,10 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
     counts: Int[Numbers, "counters cells"]
 
 
+#: A number of runs or of rounds; and the indices of the modes, in groups, each with a program of its own.
+Count = Int[Array, ""] | int
+Groups = Sequence[Sequence[int]]
+
 #: The `HybridOutcome` of some runs, and further data that is kept of them.
 Carry = tuple[PyTree, ...]
 
@@ -277,7 +281,7 @@ Advance = Callable[[Sequence[int], Int[Numbers, " cells"], Int[Numbers, ""], Car
 
 
 def at_start(
-    mode: Int[Numbers, " cells"], state: Float[Numbers, "components cells"], cells: Int[Array, ""] | int, counters: int
+    mode: Int[Numbers, " cells"], state: Float[Numbers, "components cells"], cells: Count, counters: int
 ) -> HybridOutcome[Numbers]:
     """All cells at their start, the first `cells` of them running."""
     xp = mode.__array_namespace__()
@@ -325,7 +329,7 @@ def advanced(advance: Advance, numbers: Sequence[int], carry: Carry, mask: Bool[
     return jax.lax.cond(jnp.any(mask), of_masked, lambda: carry)
 
 
-def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, reset: Advance) -> tuple[Carry, Carry]:
+def one_round(carry: Carry, groups: Groups, solve: Advance, reset: Advance) -> tuple[Carry, Carry]:
     """Advance every running cell through its mode, and through the reset map if it is at the end of the mode.
 
     **Arguments:**
@@ -346,13 +350,7 @@ def one_round(carry: Carry, groups: Sequence[Sequence[int]], solve: Advance, res
     return ended, after
 
 
-def all_rounds(
-    carry: Carry,
-    groups: Sequence[Sequence[int]],
-    solve: Advance,
-    reset: Advance,
-    most_rounds: int | Int[Array, ""] = MOST_ROUNDS,
-) -> Carry:
+def all_rounds(carry: Carry, groups: Groups, solve: Advance, reset: Advance, most_rounds: Count = MOST_ROUNDS) -> Carry:
     """Loop over rounds while a cell is running, on the host if the runs are NumPy arrays. **Arguments:** as for `one_round`."""
     xp = carry[0].status.__array_namespace__()
     if xp is np:

@@ -20,6 +20,7 @@ from .ensemble import (
     AbstractHoppingMode,
     Advance,
     Carry,
+    Count,
     HybridOutcome,
     Modes,
     Transition,
@@ -235,7 +236,7 @@ def solve_hybrid_with_samples(
     state: States,
     times: Float[Array, "times *cells"],
     t1: Float[Array, "..."],
-    cells: Int[Array, ""] | int,
+    cells: Count,
     settings: Settings,
     *,
     counters: int,
@@ -263,12 +264,7 @@ def solve_hybrid_with_samples(
 
 
 def sampled_with_tangents(
-    built: Built,
-    tangents: Tangents,
-    horizon: tuple[Array, Array],
-    cells: Int[Array, ""] | int,
-    settings: Settings,
-    counters: int,
+    built: Built, tangents: Tangents, horizon: tuple[Array, Array], cells: Count, settings: Settings, counters: int
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The runs, and their derivative along each tangent."""
     (modes, first, state), (times, t1) = built, horizon

@@ -256,6 +256,11 @@ Horizon = Float[Array, "*lanes"] | tuple[Float[Array, "*lanes times"], Float[Arr
 #: A set of data of runs.
 Data = AbstractRecording | AbstractEventTimes
 
+#: The data of a fit, its free numbers, and priors of them, by their names.
+AllData = Data | Sequence[Data]
+FreeNumbers = Mapping[str, Free | float]
+Priors = Mapping[str, Prior] | None
+
 
 class Source(eqx.Module):
     """A set of data and the model of its runs: one run, or one for each value of the numbers of the model's start."""
@@ -441,8 +446,8 @@ EXPECTED = "a nonholonomic.Recording or EventTimes"
 @explaining
 def identify(
     system: object,
-    data: Data | Sequence[Data],
-    free: Mapping[str, Free | float],
+    data: AllData,
+    free: FreeNumbers,
     *,
     starts: int = 16,
     spread: float = 2.0,
@@ -495,12 +500,7 @@ def identify(
 
 @explaining
 def log_density(
-    system: object,
-    data: Data | Sequence[Data],
-    free: Mapping[str, Free | float],
-    priors: Mapping[str, Prior] | None = None,
-    *,
-    tolerance: float = 1e-8,
+    system: object, data: AllData, free: FreeNumbers, priors: Priors = None, *, tolerance: float = 1e-8
 ) -> LogDensity:
     """The log of the posterior density of a system's parameters, as a function of unbounded coordinates.
 
@@ -534,8 +534,8 @@ def log_density(
 
 def fit_runs(
     system: object,
-    data: Data | Sequence[Data],
-    free: Mapping[str, Free | float],
+    data: AllData,
+    free: FreeNumbers,
     expected: str,
     tolerance: float,
     search: dict[str, Any],
@@ -555,9 +555,9 @@ def fit_runs(
 
 def posterior_of_runs(
     system: object,
-    data: Data | Sequence[Data],
-    free: Mapping[str, Free | float],
-    priors: Mapping[str, Prior] | None,
+    data: AllData,
+    free: FreeNumbers,
+    priors: Priors,
     expected: str,
     tolerance: float,
     slopes: str | None = None,
@@ -638,7 +638,7 @@ def of_data(parameters: dict[str, Value], k: int) -> dict[str, Value]:
     return {name: value for name, value in pairs if not name.startswith("data[")}
 
 
-def free_numbers(free: Mapping[str, Free | float], sources: Sequence[Source]) -> dict[str, Free]:
+def free_numbers(free: FreeNumbers, sources: Sequence[Source]) -> dict[str, Free]:
     """The unknowns of a model and its data: their full names, and a lower bound of 0 for parameters that cannot be negative.
 
     **Arguments:** `free`: name, or its unambiguous end, -> a `Free` or a start value. `data[1].launch.azimuth` is a

@@ -23,7 +23,7 @@ from nonholonomic.integration import AbstractProblem, Outcome
 from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_run
 from nonholonomic.parameters import description, full_axes, numbers
 from nonholonomic.runs.event import EventFunction, with_clock, with_event
-from nonholonomic.runs.identify import Data, Prior, fit_runs, posterior_of_runs
+from nonholonomic.runs.identify import AllData, FreeNumbers, Priors, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, run_of, statuses
 from nonholonomic.runs.sweep import Options, table_of
 from nonholonomic.runs.table import TableForm
@@ -452,8 +452,8 @@ EXPECTED = "a Recording or a nonholonomic.EventTimes"
 @explaining
 def identify(
     scene: Scene,
-    data: Data | Sequence[Data],
-    free: Mapping[str, identification.Free | float],
+    data: AllData,
+    free: FreeNumbers,
     *,
     starts: int = 16,
     spread: float = 2.0,
@@ -501,12 +501,7 @@ def identify(
 
 @explaining
 def log_density(
-    scene: Scene,
-    data: Data | Sequence[Data],
-    free: Mapping[str, identification.Free | float],
-    priors: Mapping[str, Prior] | None = None,
-    *,
-    tolerance: float = 1e-8,
+    scene: Scene, data: AllData, free: FreeNumbers, priors: Priors = None, *, tolerance: float = 1e-8
 ) -> identification.LogDensity:
     """The log of the posterior density of the parameters of a scene and its launch, as a function of unbounded coordinates.
 

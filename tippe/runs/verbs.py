@@ -665,11 +665,7 @@ def inversion_time(
 @of_launches
 @status_line("simulating")
 def reversal_time(
-    scene: Scene,
-    launch: Launch,
-    t1: float | Float[Array, ""],
-    tolerance: float | Float[Array, ""] = 1e-9,
-    solver: diffrax.AbstractERK | None = None,
+    scene: Scene, launch: Launch, t1: Number, tolerance: Number = 1e-9, solver: diffrax.AbstractERK | None = None
 ) -> Float[Array, ""] | float:
     """Time at which the spin about the arena's normal first vanishes; works under `jit`, `vmap`, `grad`, `jvp` and their
     compositions.
@@ -787,11 +783,7 @@ LEAST_ANGLE = 1e-6
 @of_launches
 @status_line("simulating")
 def extended_inversion_time(
-    scene: Scene,
-    launch: Launch,
-    t1: float | Float[Array, ""],
-    angle: Float[ArrayLike, ""] = 0.95 * math.pi,
-    tolerance: float | Float[Array, ""] = 1e-8,
+    scene: Scene, launch: Launch, t1: Number, angle: Number = 0.95 * math.pi, tolerance: Number = 1e-8
 ) -> Float[Array, ""]:
     """Inversion time, continued beyond the horizon, for loss functions: the result is finite everywhere, and its slope
     leads back to inversion.
