@@ -15,15 +15,7 @@ from nonholonomic import identification
 from nonholonomic.derivatives import differentiable_solve
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import numbers
-from nonholonomic.runs.identify import (
-    AbstractEventTimes,
-    AllData,
-    Cells,
-    FreeNumbers,
-    Priors,
-    fit_runs,
-    posterior_of_runs,
-)
+from nonholonomic.runs.identify import AbstractEventTimes, Cells, Data, FreeNumbers, Priors, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel
 from nonholonomic.text import distinguishing_labels, unit_of
 from nonholonomic.validation import as_number, is_traced, require_kind, require_scalars, warn
@@ -40,7 +32,7 @@ EXPECTED = "an InversionTimes, a ReversalTimes or a Recording"
 @of_launches
 def identify(
     scene: Scene,
-    data: AllData,
+    data: Data,
     free: FreeNumbers,
     *,
     starts: int = 16,
@@ -97,7 +89,7 @@ def identify(
 
 @of_launches
 def log_density(
-    scene: Scene, data: AllData, free: FreeNumbers, priors: Priors = None, *, tolerance: float = 1e-8
+    scene: Scene, data: Data, free: FreeNumbers, priors: Priors = None, *, tolerance: float = 1e-8
 ) -> identification.LogDensity:
     """The log of the posterior density of a scene's parameters, as a function of unbounded coordinates.
 

@@ -2,7 +2,6 @@
 returns."""
 
 import abc
-import math
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -264,7 +263,7 @@ class Contensou(AbstractFriction):
     slip_speed: Float[Array, "..."] = eqx.field(converter=as_number, metadata=SLIP_SPEED)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
-        lever = 3.0 * math.pi / 16.0 * self.contact_radius
+        lever = 3.0 * np.pi / 16.0 * self.contact_radius
         drilling = lever * slip.turning[2]
         speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + drilling * drilling + self.slip_speed * self.slip_speed)
         factor = -self.mu / speed
@@ -398,7 +397,7 @@ def drive(law: AbstractFriction) -> str | None:
     """The message about a law whose power is positive for one of some slips in eight directions; `None` if the law
     always brakes."""
     angle, speed, turning = (
-        grid.ravel() for grid in np.meshgrid(np.arange(8) * math.pi / 4.0, SPEEDS, TURNINGS, indexing="ij")
+        grid.ravel() for grid in np.meshgrid(np.arange(8) * np.pi / 4.0, SPEEDS, TURNINGS, indexing="ij")
     )
     x, y = speed * np.cos(angle), speed * np.sin(angle)
     try:

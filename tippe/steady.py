@@ -27,7 +27,6 @@ an inverted top is stable above 41.31 rad/s
 """
 
 import dataclasses
-import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -36,19 +35,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from nonholonomic import validation
 from nonholonomic.geometry import CarriedFrame, Torus
 from nonholonomic.integration.dense import sign_changes
 from nonholonomic.parameters import numbers
 from nonholonomic.text import shown
-from nonholonomic.validation import (
-    as_number,
-    require,
-    require_flag,
-    require_kind,
-    require_outside,
-    require_scalars,
-    require_whole,
-)
+from nonholonomic.validation import as_number, require, require_kind, require_scalars
 
 from .model.body import Top
 from .model.dynamics import AXIS, PLACE, joined, parts
@@ -66,7 +58,7 @@ def _require_top(body: object, caller: str | None = None) -> None:
     if not isinstance(body, Top):
         raise ValueError(f"body = {shown(body)} must be a Top: the formulas are those of a sphere")
     if caller is not None:
-        require_outside(body, caller, "steady.proportions")
+        validation.require_outside(body, caller, "steady.proportions")
         require_scalars(numbers("body", body), MANY)
 
 
@@ -89,7 +81,7 @@ def _require_standing(scene: Scene, spin: object, inverted: object) -> None:
             f"body = {kind} must be a body of revolution, such as a Top or a SpheroidBody, to stand and spin"
         )
     require(spin, "spin")
-    require_flag(inverted, "inverted")
+    validation.require_flag(inverted, "inverted")
 
 
 # Tumbling tops on the plane: the motion, its stability, its energy and its state.
@@ -193,7 +185,7 @@ def tumbling_angles(scene: Scene[Top], jellett: float, samples: int = 2001) -> l
     _require_scene_of_a_top(scene)
     require(jellett, "jellett")
     require_scalars(numbers("scene", scene, functions=False) | {"jellett": jellett}, MANY)
-    require_whole(samples, "samples", 4)
+    validation.require_whole(samples, "samples", 4)
     grid = jnp.linspace(0.0, jnp.pi, samples)
 
     def slope(theta):
@@ -246,7 +238,7 @@ def _lever_and_inertia(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> tup
     **Raises:** `ValueError` unless this is a scene on the plane, and theta an angle [rad] in [0, pi], or several.
     """
     _require_scene_of_a_top(scene)
-    require(theta, "theta", at_least=0.0, at_most=math.pi, unit="rad")
+    require(theta, "theta", at_least=0.0, at_most=np.pi, unit="rad")
     alpha, _ = proportions(scene.body)
     s, c = jnp.sin(theta), jnp.cos(theta)
     lever = scene.body.I3 * (alpha - c) + scene.body.I1 * c

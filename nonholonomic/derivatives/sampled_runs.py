@@ -3,7 +3,6 @@
 import abc
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
@@ -44,7 +43,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
 
     #: Up to this many numbers, the derivatives with respect to all of them are integrated forward, beside the run; with
     #: more, a gradient takes one backward pass.
-    most_forward: ClassVar[float] = math.inf
+    most_forward: ClassVar[float] = jnp.inf
 
     @property
     def movable(self) -> int:

@@ -13,7 +13,6 @@ Vectors are tuples of three components, each a number or an array over lanes, or
 """
 
 import abc
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 
@@ -307,7 +306,7 @@ class Plane(AbstractSurface):
     tilt: Float[Array, "..."] | None = eqx.field(
         converter=none_if_zero,
         default=None,
-        metadata={"range": {"at_least": -math.pi / 2.0, "at_most": math.pi / 2.0, "unit": "rad"}, "usual": Usual(0.9)},
+        metadata={"range": {"at_least": -jnp.pi / 2.0, "at_most": jnp.pi / 2.0, "unit": "rad"}, "usual": Usual(0.9)},
     )
 
     @property
@@ -442,7 +441,7 @@ class AbstractQuadric(AbstractGradientSurface):
     def place_bounds(self, place: Place, size: Component) -> Iterator[Bound]:
         yield from super().place_bounds(place, size)
         if len(place) == 2:
-            limit = math.pi / 2.0 + 1e-12
+            limit = jnp.pi / 2.0 + 1e-12
             reason = "reduced latitude, from -pi/2 to pi/2"
             yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=reason, unit="rad")
 

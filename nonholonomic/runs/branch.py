@@ -1,8 +1,6 @@
 """Periodic orbits as `runs/orbit.py` finds them, and their branches over a number, with special points
 (`runs/continuation.py` follows them)."""
 
-import itertools
-import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -91,7 +89,7 @@ class Orbit(eqx.Module):
         distances = jnp.abs(self.multipliers - 1.0)
         nearest = jnp.argsort(jnp.argsort(distances, axis=-1), axis=-1)
         # Round-off splits a double multiplier by the square root of its error.
-        is_own = (nearest < 2 * jnp.asarray(self.family)[..., None]) & (distances < math.sqrt(RANK))
+        is_own = (nearest < 2 * jnp.asarray(self.family)[..., None]) & (distances < RANK**0.5)
         return jnp.all(is_own | (jnp.abs(self.multipliers) < 1.0 - ON_CIRCLE), axis=-1)
 
     @property
@@ -359,7 +357,7 @@ class Branch(eqx.Module):
         # At the end of a stable stretch an orbit may count as unstable.
         edges = stable[:-1] | stable[1:]
         starts = [0, *(np.flatnonzero(np.diff(edges)) + 1), len(edges)]
-        for begin, end in itertools.pairwise(starts):
+        for begin, end in zip(starts, starts[1:], strict=False):
             label = "stable" if edges[begin] else "unstable"
             named = label in panel.get_legend_handles_labels()[1]
             part, style = slice(begin, end + 1), "-" if edges[begin] else "--"

@@ -256,8 +256,7 @@ Horizon = Float[Array, "*lanes"] | tuple[Float[Array, "*lanes times"], Float[Arr
 #: A set of data of runs.
 Data = AbstractRecording | AbstractEventTimes
 
-#: The data of a fit, its free numbers, and priors of them, by their names.
-AllData = Data | Sequence[Data]
+#: The free numbers of a fit, and their priors, by their names.
 FreeNumbers = Mapping[str, Free | float]
 Priors = Mapping[str, Prior] | None
 
@@ -446,7 +445,7 @@ EXPECTED = "a nonholonomic.Recording or EventTimes"
 @explaining
 def identify(
     system: object,
-    data: AllData,
+    data: Data | Sequence[Data],
     free: FreeNumbers,
     *,
     starts: int = 16,
@@ -500,7 +499,7 @@ def identify(
 
 @explaining
 def log_density(
-    system: object, data: AllData, free: FreeNumbers, priors: Priors = None, *, tolerance: float = 1e-8
+    system: object, data: Data | Sequence[Data], free: FreeNumbers, priors: Priors = None, *, tolerance: float = 1e-8
 ) -> LogDensity:
     """The log of the posterior density of a system's parameters, as a function of unbounded coordinates.
 
@@ -534,7 +533,7 @@ def log_density(
 
 def fit_runs(
     system: object,
-    data: AllData,
+    data: Data | Sequence[Data],
     free: FreeNumbers,
     expected: str,
     tolerance: float,
@@ -555,7 +554,7 @@ def fit_runs(
 
 def posterior_of_runs(
     system: object,
-    data: AllData,
+    data: Data | Sequence[Data],
     free: FreeNumbers,
     priors: Priors,
     expected: str,

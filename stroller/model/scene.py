@@ -1,6 +1,5 @@
 """The scene: vehicle, ground, friction and gravity; launches, and rides as problems."""
 
-import math
 from collections.abc import Iterator
 from typing import Any, ClassVar, TypeAlias
 
@@ -32,10 +31,10 @@ def as_numbers(value: Any) -> Any:
 
 
 #: Largest usual angles [rad] of a recording: a front wheel that turns by half a turn, and a heading after two turns.
-USUAL = {"steering": math.pi, "heading": 4.0 * math.pi}
+USUAL = {"steering": np.pi, "heading": 4.0 * np.pi}
 
 #: Angles that are greater may be in degrees, and are wrong beyond a turn.
-STEERING, HEADING = {"usual": Usual(math.pi, turns=1)}, {"usual": Usual(2.0 * math.pi, turns=1)}
+STEERING, HEADING = {"usual": Usual(np.pi, turns=1)}, {"usual": Usual(2.0 * np.pi, turns=1)}
 
 #: Speeds above 60 m/s suggest kilometres per hour. Gravity may be zero.
 SPEED, GRAVITY = {"usual": Usual(60.0, {"km/h": 1.0 / 3.6})}, Bound.GRAVITY | Bound.NOT_NEGATIVE

@@ -23,7 +23,7 @@ from nonholonomic.integration import AbstractProblem, Outcome
 from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_run
 from nonholonomic.parameters import description, full_axes, numbers
 from nonholonomic.runs.event import EventFunction, with_clock, with_event
-from nonholonomic.runs.identify import AllData, FreeNumbers, Priors, fit_runs, posterior_of_runs
+from nonholonomic.runs.identify import Data, FreeNumbers, Priors, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, run_of, statuses
 from nonholonomic.runs.sweep import Options, table_of
 from nonholonomic.runs.table import TableForm
@@ -452,7 +452,7 @@ EXPECTED = "a Recording or a nonholonomic.EventTimes"
 @explaining
 def identify(
     scene: Scene,
-    data: AllData,
+    data: Data,
     free: FreeNumbers,
     *,
     starts: int = 16,
@@ -501,7 +501,7 @@ def identify(
 
 @explaining
 def log_density(
-    scene: Scene, data: AllData, free: FreeNumbers, priors: Priors = None, *, tolerance: float = 1e-8
+    scene: Scene, data: Data, free: FreeNumbers, priors: Priors = None, *, tolerance: float = 1e-8
 ) -> identification.LogDensity:
     """The log of the posterior density of the parameters of a scene and its launch, as a function of unbounded coordinates.
 

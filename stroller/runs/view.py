@@ -1,6 +1,5 @@
 """The drawing of a ride, and its page with sliders."""
 
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -309,7 +308,7 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     ranges = {
         "launch.speed": (min(0.0, 2.0 * speed), max(3.0, 2.0 * speed)),
         "launch.steering": (-max(0.9, steering), max(0.9, steering)),
-        "launch.heading": (max(heading - math.pi, -2.0 * math.pi), min(heading + math.pi, 2.0 * math.pi)),
+        "launch.heading": (max(heading - np.pi, -2.0 * np.pi), min(heading + np.pi, 2.0 * np.pi)),
     }
     friction = numbers("scene.friction", scene.friction).items()
     damping = {path: float(value) for path, value in friction if value is not None and path.endswith("ing")}

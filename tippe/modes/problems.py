@@ -1,6 +1,5 @@
 """Motion on one smooth contact, as problems for the integrator, and the base of the modes with flights."""
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +26,7 @@ class StemContact(eqx.Module):
 
 
 #: The inclination [rad] at which a body without a stem counts as turned over.
-INVERTED = 0.95 * math.pi
+INVERTED = 0.95 * jnp.pi
 
 #: Stands for the cosine of the angle where the event is that the stem first carries the top, so that one program serves both;
 #: and the cosine that puts every state beyond the event.

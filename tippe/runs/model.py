@@ -1,7 +1,6 @@
 """The top as a model for the functions of `nonholonomic.runs`."""
 
 import dataclasses
-import math
 from collections import Counter
 from collections.abc import Collection
 from typing import Any
@@ -239,7 +238,7 @@ class TopModel(AbstractSceneModel):
         scene, launch = self.scene, self.launch
         bounds = [*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch)]
         if self.angle is not None and not isinstance(self.angle, StemContact):
-            bounds.append(Bound(self.angle, "angle", above=0.0, at_most=math.pi, unit="rad"))
+            bounds.append(Bound(self.angle, "angle", above=0.0, at_most=np.pi, unit="rad"))
         is_legal = legal(bounds)
         return is_legal & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0) if self.reverses else is_legal
 
@@ -265,7 +264,7 @@ class TopModel(AbstractSceneModel):
         if continues and isinstance(self.angle, StemContact):
             raise ValueError(
                 "crossing = 'last' has no derivatives for the contact of a stem: give an angle, such as "
-                "angle=0.95 * math.pi, or take crossing = 'first'"
+                "angle=0.95 * np.pi, or take crossing = 'first'"
             )
         if nested and not self.smooth:
             raise ValueError(
@@ -292,7 +291,7 @@ class TopModel(AbstractSceneModel):
         if isinstance(scene.frame, CarriedFrame) or (isinstance(scene.body, AbstractRigidBody) and not scene.level):
             place = "a level plane for this body" if scene.contact == "stop" else "contact = 'stop'"
             raise ValueError(f"system: periodic motions are found on planes, cylinders and spheres; choose {place}")
-        Bound(self.launch.theta, "theta", above=0.0, below=math.pi, why="the axis must lean on the section").require()
+        Bound(self.launch.theta, "theta", above=0.0, below=np.pi, why="the axis must lean on the section").require()
         first = jnp.zeros(1, int) if self.smooth else self.modes(1, jnp.asarray(1e-9), self.comparable, False)[1]
         state = self.reduced(scene.state(self.launch)[:, None], first)[:, 0]
         values = dict(zip(self.reduced_names, state, strict=True))

@@ -1,7 +1,6 @@
 """The quantities of a run of a tippe top, in contact or through flights: one state at each time."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self, TypeAlias, TypeVar
 
@@ -305,7 +304,7 @@ class AbstractTrajectory(AbstractRun):
         if self.dense is None or not isinstance(self.scene.body, AbstractBody):
             return ()
         time = self.inversion_time
-        fell = ", fell back" if float(self.theta[-1]) < math.pi / 2.0 else ""
+        fell = ", fell back" if float(self.theta[-1]) < np.pi / 2.0 else ""
         return ((time, f"turned over at {time:.3g} s{fell}"),) if np.isfinite(time) else ()
 
     @of_each_run
@@ -366,7 +365,7 @@ class AbstractTrajectory(AbstractRun):
         ]
         if self.dense is not None and isinstance(self.scene.body, AbstractBody):
             words = self._whether_it_turned_over
-            fell_back = words.startswith("turned") and float(self.theta[-1]) < math.pi / 2.0
+            fell_back = words.startswith("turned") and float(self.theta[-1]) < np.pi / 2.0
             lines.append(f"  {words}{', but fell back' if fell_back else ''}")
         if word == "contact_lost" and self.scene.contact == "stop" and isinstance(self.scene.body, Top):
             lines.append("  to continue through the flight, use a Scene with contact='hybrid'")
