@@ -139,15 +139,19 @@ def require_scalars(values: Mapping[str, Any], otherwise: str) -> None:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; {otherwise}")
 
 
-def require_kind(value: object, name: str, kind: type, example: str = "", several: str = "") -> None:
-    """Raise `ValueError` unless a value is of the given kind, such as a `Scene`.
+#: What a value must be.
+Kind = TypeVar("Kind")
+
+
+def require_kind(value: object, name: str, kind: type[Kind], example: str = "", several: str = "") -> Kind:
+    """Return a value of the given kind, such as a `Scene`; raise `ValueError` for anything else.
 
     If the value is a module of the same name from another package, such as a stroller's scene for a top, the message
     names both packages. For a list of values of the kind, the message says what accepts `several`. Otherwise it ends in
     the `example`.
     """
     if isinstance(value, kind):
-        return
+        return value
     kind_name = kind.__name__.removeprefix("Abstract")
     if isinstance(value, list | tuple) and value and all(isinstance(part, kind) for part in value):
         raise ValueError(

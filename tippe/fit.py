@@ -214,9 +214,8 @@ class InversionTimes(AbstractTimes):
         return self.t1
 
     def model(self, system: object) -> TopModel:
-        require_kind(system, "scene", Scene)
-        assert isinstance(system, Scene)
-        return TopModel.timed(system, self.launch, event_of(system, self.angle))
+        scene = require_kind(system, "scene", Scene)
+        return TopModel.timed(scene, self.launch, event_of(scene, self.angle))
 
     def predicted(self, model: TopModel, t1: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
         return differentiable_solve(*ExtendedTime.of(model, t1, settings, False))
@@ -251,10 +250,9 @@ class ReversalTimes(AbstractTimes):
     units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s"}
 
     def model(self, system: object) -> TopModel:
-        require_kind(system, "scene", Scene)
-        assert isinstance(system, Scene)
-        check_reversible(system, self.launch)
-        return TopModel.timed(system, self.launch, None)
+        scene = require_kind(system, "scene", Scene)
+        check_reversible(scene, self.launch)
+        return TopModel.timed(scene, self.launch, None)
 
 
 @of_launches
@@ -381,9 +379,8 @@ class Recording(identification.AbstractRecording):
 
     def model(self, scene: object) -> AbstractModel:
         """The model of the recorded run."""
-        require_kind(scene, "data: the scene of a tippe.Recording", Scene)
-        assert isinstance(scene, Scene)
-        return TopModel(scene=scene, launch=self.launch)
+        known = require_kind(scene, "data: the scene of a tippe.Recording", Scene)
+        return TopModel(scene=known, launch=self.launch)
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .. import validation, views
+from .. import views
 from ..compilation.tracing import named_errors
 from ..hybrid import MOST_ROUNDS, HybridOutcome, hybrid_resets
 from ..hybrid.ensemble import OnlyMode
@@ -25,10 +25,10 @@ from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown, unit_of
-from ..validation import IN_DEGREES, explaining, is_traced, require_all, require_file, require_one_run, times_within
+from ..validation import IN_DEGREES, explaining, is_traced, require_all, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stage_of
 from ..views.explore import Frame, LiveRun, Simulator, Slider, live_page
-from ..views.pages import require_labels
+from ..views.pages import require_labels, require_page
 from ..views.stage import Draw, Drawing, Parts, Wheel, meshes_of, of_grid
 from .model import AbstractModel, Names, Sliders, model_of, run_of
 
@@ -121,18 +121,13 @@ def drawn_by(model: Any, draw: Draw) -> Any:
 
 def explore_model(model: AbstractModel, path: Any, sliders: Sliders | None, t1: float, unit: Unit, label: Any) -> Page:
     """The page of a model. **Arguments:** as for `explore`."""
-    validation.require_package("jupyter_threejs_sage", "view", "explore")
-    if path is not None:
-        require_file(path, "path", ".html", ".htm")
+    require_page(path, "explore")
     require_all(run_bounds(t1, 1e-9))
     require_unit(unit)
     model.check()
     live, stage = page_of(model, sliders, t1)
     live = live if label is None else live._replace(title=require_labels([label], [model])[0])
-    html_page = live_page(live, stage, unit=unit or unit_of(model))
-    if path is not None:
-        html_page.save(path)
-    return html_page
+    return live_page(live, stage, unit=unit or unit_of(model)).written(path)
 
 
 @functools.singledispatch

@@ -68,6 +68,12 @@ class Page(NamedTuple):
         with replacing(require_file(path, "path", ".html", ".htm")) as scratch:
             scratch.write_text(self.html, encoding="utf-8")
 
+    def written(self, path: str | os.PathLike[str] | None) -> "Page":
+        """The page itself, saved if there is a path."""
+        if path is not None:
+            self.save(path)
+        return self
+
     def _repr_html_(self) -> str:
         style = "width:100%;height:820px;border:0"
         return f'<iframe srcdoc="{html.escape(self.html)}" style="{style}" allow="fullscreen" loading="lazy"></iframe>'
@@ -119,6 +125,13 @@ def page(
         parts["VIEW"] = "\n".join([*view, *(script(template(name)) for name in SCRIPTS), *scripts])
     # In one pass: a title may contain the mark of another part.
     return Page(re.sub(r"\[([A-Z]+)\]", lambda mark: parts[mark[1]], template("page.html")))
+
+
+def require_page(path: object, caller: str) -> None:
+    """Raise the errors of `Page.written`, before the work begins, and `ModuleNotFoundError` without the package for pages."""
+    require_package("jupyter_threejs_sage", "view", caller)
+    if path is not None:
+        require_file(path, "path", ".html", ".htm")
 
 
 def table_as_html(rows: list[list[str]], heads: int) -> str:
@@ -344,13 +357,8 @@ class Viewable:
 
         **Example:** `examples/a_page.py`.
         """
-        require_package("jupyter_threejs_sage", "view", "view")
-        if path is not None:
-            require_file(path, "path", ".html", ".htm")
-        html_page = self._page(others, overlaid, unit, draw, label, speed=0.5)
-        if path is not None:
-            html_page.save(path)
-        return html_page
+        require_page(path, "view")
+        return self._page(others, overlaid, unit, draw, label, speed=0.5).written(path)
 
     @status_line("drawing")
     def animate(

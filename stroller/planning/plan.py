@@ -14,8 +14,9 @@ from scipy.interpolate import CubicSpline
 from nonholonomic.geometry import Plane
 from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit, shown
-from nonholonomic.validation import explaining, require_file, require_flag, require_kind, require_package, require_whole
-from nonholonomic.views import DARK, Body, Mesh, Page, Stage, bar, page
+from nonholonomic.validation import explaining, require_flag, require_kind, require_package, require_whole
+from nonholonomic.views import DARK, Body, Mesh, Page, Stage, bar
+from nonholonomic.views.pages import page, require_page
 from nonholonomic.views.plot import draw_title, new_figure
 from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
@@ -171,15 +172,10 @@ class Plan(eqx.Module):
         **Raises:** `ModuleNotFoundError` if jupyter-threejs-sage is not installed, `OSError` if the file cannot be
         written, `ValueError` for another file type.
         """
-        require_package("jupyter_threejs_sage", "view", "view")
-        if path is not None:
-            require_file(path, "path", ".html", ".htm")
+        require_page(path, "view")
         require_unit(unit)
         (stage,) = curves_in([planned_stage(self)], unit)
-        html_page = page([stage], stage.title, speed=1.0)
-        if path is not None:
-            html_page.save(path)
-        return html_page
+        return page([stage], stage.title, speed=1.0).written(path)
 
 
 # The check of a drive: a run at a tight tolerance, the exact clearance of the whole footprint, and every limit.

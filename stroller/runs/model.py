@@ -579,10 +579,9 @@ class Recording(identification.AbstractRecording):
 
     def model(self, scene: object) -> AbstractModel:
         """The model of the recorded ride, checked."""
-        require_kind(scene, "data: the scene of a stroller.Recording", Scene)
-        assert isinstance(scene, Scene)
-        scene.check(self.launch)
-        return RideModel.of(scene, self.launch, self.input, None, self.jumps)
+        known = require_kind(scene, "data: the scene of a stroller.Recording", Scene)
+        known.check(self.launch)
+        return RideModel.of(known, self.launch, self.input, None, self.jumps)
 
     def __check_init__(self):
         require_kind(self.launch, "launch", Launch, several="identify takes a list of recordings")
