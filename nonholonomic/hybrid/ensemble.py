@@ -117,8 +117,9 @@ class AbstractBatchedMode(eqx.Module):
         raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
 
 
-#: The modes of a system, by their index.
+#: The modes of a system, by their index; and the state of one run.
 Modes = tuple[AbstractBatchedMode, ...]
+OneState = Float[Array | np.ndarray, " components"]
 
 
 class StartedProblem(CoreProblem):
@@ -524,7 +525,7 @@ def _advances(
 
 
 def hybrid_resets(
-    modes: Modes, number: int, state: Float[np.ndarray, " components"], t1: float, settings: Settings, *, counters: int
+    modes: Modes, number: int, state: OneState, t1: float, settings: Settings, *, counters: int
 ) -> list[tuple[HybridOutcome[np.ndarray], HybridOutcome[np.ndarray]]]:
     """The run of one cell before and after each of its resets.
 
@@ -667,13 +668,7 @@ _between = eqx.filter_jit(lambda mode, motion, elapsed: mode.between(motion, ela
 
 
 def solve_hybrid_dense(
-    modes: Modes,
-    number: int,
-    state: Float[Array | np.ndarray, " components"],
-    t1: float,
-    settings: Settings,
-    *,
-    counters: int,
+    modes: Modes, number: int, state: OneState, t1: float, settings: Settings, *, counters: int
 ) -> HybridPath:
     """Integrate one run through its modes to `t1`, to an event during a transition, or to where the model ends.
 

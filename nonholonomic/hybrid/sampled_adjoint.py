@@ -33,6 +33,7 @@ from .ensemble import (
     MOST_ROUNDS,
     AbstractBatchedMode,
     Carry,
+    Count,
     HybridOutcome,
     advanced,
     at_start,
@@ -334,12 +335,7 @@ class Round(NamedTuple):
         return (Costate(by_primal, by_start_time, part.added(group, costate.numbers, by_numbers), invalid),)
 
     def through_motion(
-        self,
-        settings: Settings,
-        group: Sequence[int],
-        cell: Int[Array, " cells"],
-        count: Int[Array, ""],
-        carry: tuple[Costate],
+        self, settings: Settings, group: Sequence[int], cell: Int[Array, " cells"], count: Count, carry: tuple[Costate]
     ) -> tuple[Costate]:
         """Carry the derivatives of some cells from the end of the mode to its start."""
         (costate,), part = carry, of_cells(self, cell)

@@ -39,6 +39,10 @@ from .saltation import Tangents, VariationalMode, with_variations
 #: The modes, the index of the first mode of every cell, and the initial states.
 Built = tuple[Modes, Int[Array, " cells"], States]
 
+#: The times of samples in every cell [s]; and the factors of the output rows there, if only a sum of them is needed.
+CellTimes = Float[Array, "times cells"]
+Weights = Float[Array, "shown times cells"] | None
+
 # Output rows of runs between two modes, at given times, for many cells at once.
 
 #: A sample this much later than the last stretch of a transition, as a fraction of the horizon, still belongs to it.
@@ -46,12 +50,7 @@ ROUND_OFF = 1e-13
 
 
 def reset_with_rows(
-    mode: AbstractBatchedMode,
-    state: States,
-    left: Lanes,
-    times: Float[Array, "times cells"],
-    t1: Lanes,
-    weights: Float[Array, "shown times cells"] | None = None,
+    mode: AbstractBatchedMode, state: States, left: Lanes, times: CellTimes, t1: Lanes, weights: Weights = None
 ) -> tuple[Transition, Array | None]:
     """The transition to the next mode, and the output rows on the way.
 
@@ -87,12 +86,7 @@ def _rows_of_path(
 
 
 def _hops_with_rows(
-    mode: AbstractHoppingMode,
-    state: States,
-    left: Lanes,
-    times: Float[Array, "times cells"],
-    slack: Lanes,
-    weights: Float[Array, "shown times cells"] | None,
+    mode: AbstractHoppingMode, state: States, left: Lanes, times: CellTimes, slack: Lanes, weights: Weights
 ) -> tuple[Transition, Float[Array, "*shown_times cells"]]:
     """The stretches one by one, each with the samples inside it. No path is kept, whose length is not known."""
     cells = jnp.arange(len(left))
@@ -152,7 +146,7 @@ class Recorded(NamedTuple):
 def sampled_rounds(
     modes: tuple[VariationalMode, ...],
     start: HybridOutcome[Array],
-    times: Float[Array, "times cells"],
+    times: CellTimes,
     t1: Lanes,
     settings: Settings,
     n_blocks: int,

@@ -78,17 +78,12 @@ class Verdict(NamedTuple):
 
 
 def judge(
-    ends: Minima,
-    explorer: Explorer,
-    sample: Pool,
-    distribution: "Distribution",
-    undetermined: tuple[str, ...],
-    status: str,
+    ends: Minima, explorer: Explorer, sample: Pool, distribution: "Distribution", unseen: tuple[str, ...], status: str
 ) -> Verdict:
     """Judge a fit.
 
-    **Arguments:** `ends`: those of the search; `distribution`: that of the coordinates; `undetermined`: the combinations that
-    the data do not determine; `status`: that of the fit.
+    **Arguments:** `ends`: those of the search; `distribution`: that of the coordinates; `unseen`: the combinations that the
+    data do not determine; `status`: that of the fit.
 
     **Returns:** a `Verdict`.
     """
@@ -144,7 +139,7 @@ def judge(
             ),
         ),
         *concerns,
-        *(f"the data do not determine {words}" for words in undetermined),
+        *(f"the data do not determine {words}" for words in unseen),
     )
     notes = (
         *sentences(
@@ -162,7 +157,7 @@ def judge(
         series=tuple(order for order in orders if order.count > 1),
         agree=ends.agree,
         starts=len(ends.starts),
-        undetermined=undetermined,
+        undetermined=unseen,
         concerns=concerns,
         notes=notes,
         effective=sample.effective,

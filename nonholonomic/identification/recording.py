@@ -296,6 +296,9 @@ Column = object
 AnyPath = str | PathLike[str]
 Columns = Mapping[str, Column] | None
 
+#: The SI units of quantities, by their names.
+Units = Mapping[str, str]
+
 
 class TextTable(NamedTuple):
     """A text file of columns.
@@ -311,16 +314,11 @@ class TextTable(NamedTuple):
     decimal: str
     repeated: tuple[str, ...]
     columns: Mapping[str, Column]
-    units: Mapping[str, str]
+    units: Units
 
     @classmethod
     def read(
-        cls,
-        path: AnyPath,
-        columns: Columns,
-        decimal: str,
-        units: Mapping[str, str],
-        several: Mapping[str, tuple[str, ...]],
+        cls, path: AnyPath, columns: Columns, decimal: str, units: Units, several: Mapping[str, tuple[str, ...]]
     ) -> "TextTable":
         """Read and check a file of columns. **Arguments:** `several`: names that stand for several columns."""
         if decimal not in (".", ","):
@@ -613,7 +611,7 @@ def read_launches(
     path: AnyPath,
     columns: Columns,
     error: float | Mapping[str, Column],
-    units: Mapping[str, str],
+    units: Units,
     decimal: str = ".",
     never: str | Sequence[str] = (),
 ) -> ReadLaunches:

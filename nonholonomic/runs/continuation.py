@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ..compilation.xla_cpu import compiled_for_one
 from ..integration.problem import TIGHTEST
@@ -105,20 +105,15 @@ class Returns(NamedTuple):
 
 @compiled_for_one
 def several_returns(
-    search: Any,
-    leaves: tuple[Array, ...],
-    others: tuple[int, ...],
-    state: Float[Array, " components"],
-    rate: Array,
-    near: Array,
-    tolerance: Array,
-    count: Array,
+    search: Any, leaves: tuple[Array, ...], others: tuple[int, ...], numbers: tuple[Array, ...]
 ) -> Returns:
-    """`count` returns from a state.
+    """Some returns from a state.
 
-    **Arguments:** `others`: the leaves that are the number; `rate`: derivative of the horizon by the number; `near`: a state
-    that is less than this time [s] before the section or beyond is moved onto it.
+    **Arguments:** `others`: the leaves that are the number; `numbers`: the state; the derivative of the horizon by the number;
+    the time [s] before the section or beyond, at less than which a state is moved onto it; the tolerance; and the number of
+    returns.
     """
+    state, rate, near, tolerance, count = numbers
 
     def following(k: Array, old: Returns) -> Returns:
         moved, shift, falls = search.on_section(leaves, 1, old.state[:, None])
@@ -218,8 +213,8 @@ class Continuation(NamedTuple):
         state, tolerance = np.array(self.orbit.state), max(float(leaves[-1]) / FINER, TIGHTEST)
         state[list(search.free)] = moved
         near = NEAR * float(self.orbit.period) / self.orbit.returns * self.in_motion
-        numbers = map(np.asarray, (state, rate, near, tolerance, self.returns))
-        return jax.tree.map(np.asarray, several_returns(search, tuple(leaves), self.others, *numbers))
+        numbers = tuple(map(np.asarray, (state, rate, near, tolerance, self.returns)))
+        return jax.tree.map(np.asarray, several_returns(search, tuple(leaves), self.others, numbers))
 
     def linearized(self, unknowns: np.ndarray) -> Linear:
         """The returns, the derivative of the residual by the unknowns, and the unknowns at the start that was moved; raises

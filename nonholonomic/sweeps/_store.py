@@ -67,54 +67,6 @@ def table_path(path: object) -> Path:
     return file
 
 
-def write_file(path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values] | None]]) -> None:
-    """Write a table completely or not at all; an existing file is replaced.
-
-    **Arguments:** `chunks`: the index of a chunk and its cells by variable, in any order; other chunks, and those with
-    `None`, stay unfinished.
-
-    **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for words that a file cannot hold.
-    """
-    with replacing(path) as scratch, Stream(scratch, "r+b") as stream:
-        places = _describe(stream, layout)
-        for chunk, values in chunks:
-            if values is not None:
-                write_chunk(stream, layout, places, chunk, values)
-                stream.check()
-
-
-def write_chunk(
-    stream: "Stream",
-    layout: Layout,
-    places: dict[str, int],
-    chunk: int,
-    values: dict[str, Values],
-    synced: bool = False,
-) -> None:
-    """Write the numbers of a chunk and their checksums, and mark it as finished when they are on disk; the caller checks
-    the stream for the mark.
-
-    **Arguments:** `places`: where the file has the numbers of its arrays; `synced`: whether to wait for the disk.
-
-    **Raises:** `OSError` if that fails; `ValueError`, before anything is written, if a variable has the wrong shape.
-    """
-    first, end = layout.ends(chunk)
-    variables = {name: np.ascontiguousarray(values[name], kind) for name, kind in layout.kinds.items()}
-    for name, cells in variables.items():
-        # Longer data would overwrite other chunks and the description of the file.
-        shape = (end - first, *layout.inner_shape(name))
-        if cells.shape != shape:
-            raise ValueError(f"{name} of cells {first} to {end - 1} must have the shape {shape}, not {cells.shape}")
-    for name, cells in variables.items():
-        stream.seek(places[name] + layout.bytes_of_cells(first, name))
-        stream.write(cells.tobytes())
-        stream.seek(places[f"{CHECKSUMS}/{name}"] + 4 * chunk)
-        stream.write(zlib.crc32(cells.data).to_bytes(4, "little"))
-    stream.check(synced)
-    stream.seek(places[f"{CHECKSUMS}/{FINISHED}"] + chunk)
-    stream.write(b"\xff")
-
-
 class Stream(io.FileIO):
     """A file that keeps the first error until `check`: HDF5 cannot close a file after a write to a full disk has failed."""
 
@@ -144,6 +96,49 @@ class Stream(io.FileIO):
             raise self.error
         if synced:
             os.fsync(self.fileno())
+
+
+def write_file(path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values] | None]]) -> None:
+    """Write a table completely or not at all; an existing file is replaced.
+
+    **Arguments:** `chunks`: the index of a chunk and its cells by variable, in any order; other chunks, and those with
+    `None`, stay unfinished.
+
+    **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for words that a file cannot hold.
+    """
+    with replacing(path) as scratch, Stream(scratch, "r+b") as stream:
+        places = _describe(stream, layout)
+        for chunk, values in chunks:
+            if values is not None:
+                write_chunk(stream, layout, places, chunk, values)
+                stream.check()
+
+
+def write_chunk(
+    stream: Stream, layout: Layout, places: dict[str, int], chunk: int, values: dict[str, Values], synced: bool = False
+) -> None:
+    """Write the numbers of a chunk and their checksums, and mark it as finished when they are on disk; the caller checks
+    the stream for the mark.
+
+    **Arguments:** `places`: where the file has the numbers of its arrays; `synced`: whether to wait for the disk.
+
+    **Raises:** `OSError` if that fails; `ValueError`, before anything is written, if a variable has the wrong shape.
+    """
+    first, end = layout.ends(chunk)
+    variables = {name: np.ascontiguousarray(values[name], kind) for name, kind in layout.kinds.items()}
+    for name, cells in variables.items():
+        # Longer data would overwrite other chunks and the description of the file.
+        shape = (end - first, *layout.inner_shape(name))
+        if cells.shape != shape:
+            raise ValueError(f"{name} of cells {first} to {end - 1} must have the shape {shape}, not {cells.shape}")
+    for name, cells in variables.items():
+        stream.seek(places[name] + layout.bytes_of_cells(first, name))
+        stream.write(cells.tobytes())
+        stream.seek(places[f"{CHECKSUMS}/{name}"] + 4 * chunk)
+        stream.write(zlib.crc32(cells.data).to_bytes(4, "little"))
+    stream.check(synced)
+    stream.seek(places[f"{CHECKSUMS}/{FINISHED}"] + chunk)
+    stream.write(b"\xff")
 
 
 def _describe(stream: Stream, layout: Layout) -> dict[str, int]:

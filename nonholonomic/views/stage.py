@@ -16,7 +16,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..geometry import AbstractSurface
 from ..text import Unit, in_unit, require_unit_of
 
-Points = Float[np.ndarray, "times 3"]
+#: Points [m], such as one for each time.
+Points = Float[np.ndarray, "points 3"]
 
 #: JAX's arrays for a page, or NumPy's for a picture.
 Kind = TypeVar("Kind", Array, np.ndarray)
@@ -126,7 +127,7 @@ class Arena(NamedTuple):
     """
 
     mesh: Mesh
-    lines: tuple[Float[np.ndarray, "points 3"], ...]
+    lines: tuple[Points, ...]
     spacing: str
     normal: Float[np.ndarray, " 3"]
     axes: tuple[tuple[str, float, float], ...] = ()
@@ -369,11 +370,7 @@ DEGREES = (1.0, 2.0, 5.0, 10.0, 15.0, 30.0)
 
 
 def arena(
-    surface: AbstractSurface,
-    points: Float[np.ndarray, "points 3"],
-    normal: Float[np.ndarray, " 3"],
-    margin: float,
-    spacing: float,
+    surface: AbstractSurface, points: Points, normal: Float[np.ndarray, " 3"], margin: float, spacing: float
 ) -> Arena:
     """The part of a surface around the given points.
 
@@ -427,7 +424,7 @@ class _Chart:
       along the surface per unit of a number, at these places.
     """
 
-    def __init__(self, surface: AbstractSurface, points: Float[np.ndarray, "points 3"]):
+    def __init__(self, surface: AbstractSurface, points: Points):
         self.surface, self.is_patch = surface, len(surface.coordinates) == 3
         if self.is_patch:
             self.middle = fixed(surface, _charted(surface, own(surface, points.mean(axis=0))))

@@ -21,12 +21,15 @@ from numpy.polynomial import Polynomial, legendre
 
 from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import AbstractFrame, Vector
-from nonholonomic.integration import Components, States
+from nonholonomic.integration import Components, Lanes, States
 from nonholonomic.integration.dense import halved
 
 from ..friction import Frictionless, Slip, length
 from .dynamics import FITS, AbstractContactDynamics, Dynamics, Motion, RollingDynamics
 from .rigid import RigidRolling, RigidSlipping
+
+#: The rates of states.
+Field = Callable[[States], States]
 
 # The onset of a slip: an implicit step from a contact at rest to a slipping contact, of the length that the tolerance
 # allows.
@@ -120,13 +123,7 @@ class Onset(eqx.Module):
 
 
 def slip_onset(
-    stick_slip: "StickSlip",
-    field: Callable[[States], States],
-    state: States,
-    size: int,
-    scales: States,
-    max_duration: Float[Array, "..."],
-    tolerance: Float[Array, ""],
+    stick_slip: "StickSlip", field: Field, state: States, size: int, scales: States, longest: Lanes, tolerance: Lanes
 ) -> Onset:
     """Compute the beginning of a slip from a contact at rest.
 
@@ -136,7 +133,7 @@ def slip_onset(
     - `field`: rate of the slipping state, including other integrated components.
     - `state`: a state at rest, (components, ...); the equations use the first `size` components; `scales`: their
       magnitudes.
-    - `max_duration`: longest duration [s]; `tolerance`: tolerance for the estimated error, relative to the magnitudes.
+    - `longest`: longest duration [s]; `tolerance`: tolerance for the estimated error, relative to the magnitudes.
 
     **Returns:** an `Onset`.
     """
@@ -180,7 +177,7 @@ def slip_onset(
         factor = jnp.clip(0.8 * (tolerance / error) ** (1.0 / STAGES), 0.4, 0.8)
         return trial + 1, jnp.where(converged, duration, factor * duration), converged, rates
 
-    duration = jnp.minimum(FIRST * tolerance ** (1.0 / STAGES) * contact.unit, max_duration)
+    duration = jnp.minimum(FIRST * tolerance ** (1.0 / STAGES) * contact.unit, longest)
     rates = jnp.zeros((*state.shape[:1], STAGES, *state.shape[1:]))
     _, duration, converged, rates = jax.lax.while_loop(
         lambda carry: (carry[0] < TRIALS) & ~jnp.all(carry[2]),
@@ -404,9 +401,7 @@ class ContactMode(StickSlip):
         """The slip's speed [m/s] and its rate."""
         return jax.jvp(self.slip_speed, (state,), (self.slipping.field(state),))
 
-    def ended(
-        self, state: States, size: int, slipping: Callable[[States], States], scales: States, left: Float[Array, "..."]
-    ) -> Change:
+    def ended(self, state: States, size: int, slipping: Field, scales: States, left: Float[Array, "..."]) -> Change:
         """The change that follows the end of this kind of motion.
 
         **Arguments:**
