@@ -261,7 +261,8 @@ def saved(solution: diffrax.Solution) -> tuple[PyTree, PyTree]:
     return solution.ts, solution.ys
 
 
-#: A state, and the magnitudes that scale its errors.
+#: The start, the end and the length of the first step [s]; a state, and the magnitudes that scale its errors.
+Span = tuple[Array, Array, Array | None]
 Start = tuple[Float[Array, " components"], Float[Array, " components"]]
 
 
@@ -292,7 +293,7 @@ def _control(
 def _solved(
     problem: AbstractProblem,
     solver: diffrax.AbstractSolver,
-    times: tuple[Array, Array, Array | None],
+    times: Span,
     state: Float[Array, " components"],
     control: diffrax.AbstractStepSizeController,
     **options: PyTree,
@@ -310,12 +311,7 @@ def _solved(
 
 @eqx.filter_jit
 def _piece(
-    problem: AbstractProblem,
-    times: tuple[Array, Array, Array],
-    start: Start,
-    settings: Settings,
-    dense: bool,
-    is_watched: bool,
+    problem: AbstractProblem, times: Span, start: Start, settings: Settings, dense: bool, is_watched: bool
 ) -> tuple[diffrax.Solution, Float[Array, "steps 2"] | None]:
     """Integrate as many steps as the settings allow; also bracket the first zero of the domain margin in each step.
 

@@ -245,7 +245,19 @@ def sweep(
     cells = size_of(axes)
     chunk_size = chunk_for(cells) if chunk is None else chunk
     chunk_size = chunk_size if most is None else min(chunk_size, most)
-    layout = layout_of(axes, inner, variables, request, chunk_size)
+    coords = {axis.name: axis.values for axis in (*axes, *inner)}
+    described = {axis.name: axis for axis in (*axes, *inner)} | variables
+    # Lists are not equal to the tuples of a file.
+    words = {name: tuple(variable.words) for name, variable in variables.items() if variable.words is not None}
+    without_unit = {*words, *(name for name, values in coords.items() if values.dtype.kind == "U")}
+    units = {name: part.unit for name, part in described.items() if name not in without_unit}
+    request = request | {"float": str(np.dtype(jnp.result_type(float)))}
+    # Without `default`: the text of an object would not tell two requests apart.
+    attributes = attributes_of(request, [axis.name for axis in axes])
+    long_names = {name: part.long_name for name, part in described.items() if part.long_name}
+    kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
+    dims = {name: tuple(variable.inner) for name, variable in variables.items() if variable.inner}
+    layout = Layout(coords, kinds, units, attributes, words, dims, chunk_size, long_names)
     layout = layout._replace(chunk=chunk_size * chunks_together(layout))
     forget_programs_if_many()
     work = ChunkTask(job, axes, chunk_size)
@@ -309,25 +321,6 @@ def computed(
                 raise_lost_interrupt()
         except ExecutorBroken as error:
             raise ExecutorBroken(f"{error}; {finished_cells} of {layout.cells} cells are done") from error.__cause__
-
-
-def layout_of(
-    axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, object], chunk: int
-) -> Layout:
-    """The layout of a sweep's table; see `sweep`."""
-    coords = {axis.name: axis.values for axis in (*axes, *inner)}
-    described = {axis.name: axis for axis in (*axes, *inner)} | variables
-    # Lists are not equal to the tuples of a file.
-    words = {name: tuple(variable.words) for name, variable in variables.items() if variable.words is not None}
-    without_unit = {*words, *(name for name, values in coords.items() if values.dtype.kind == "U")}
-    units = {name: part.unit for name, part in described.items() if name not in without_unit}
-    request = request | {"float": str(np.dtype(jnp.result_type(float)))}
-    # Without `default`: the text of an object would not tell two requests apart.
-    attributes = attributes_of(request, [axis.name for axis in axes])
-    long_names = {name: part.long_name for name, part in described.items() if part.long_name}
-    kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
-    dims = {name: tuple(variable.inner) for name, variable in variables.items() if variable.inner}
-    return Layout(coords, kinds, units, attributes, words, dims, chunk, long_names)
 
 
 def submission(work: ChunkTask, executor: Executor) -> Callable[[int, int], Future]:

@@ -33,7 +33,7 @@ from .input import Input, Motion
 State = Float[Array, "components ..."]
 
 #: A number, or one for each of several states.
-Numbers = Float[Array, "..."]
+Number = Float[Array, "..."]
 
 # The body: a rigid frame on two rear wheels, with one front wheel in a fork that steers.
 
@@ -206,13 +206,7 @@ class Dynamics(eqx.Module):
         return padded(state[:place]), padded(state[place:end]), state[end:]
 
     def state(
-        self,
-        position: Vector,
-        heading: Vector,
-        steering: Numbers,
-        steering_rate: Numbers,
-        wheel: Numbers,
-        works: int = 0,
+        self, position: Vector, heading: Vector, steering: Number, steering_rate: Number, wheel: Number, works: int = 0
     ) -> State:
         """The state of a motion.
 

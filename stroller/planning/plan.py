@@ -20,7 +20,7 @@ from nonholonomic.views.pages import page, require_page
 from nonholonomic.views.plot import draw_title, new_figure
 from nonholonomic.views.stage import curves_in, fixed, of_grid, own
 
-from ..model.dynamics import Dynamics, Numbers, padded
+from ..model.dynamics import Dynamics, Number, padded
 from ..model.scene import Launch, Scene
 from ..runs.model import simulate
 from ..runs.trajectory import Trajectory
@@ -245,8 +245,8 @@ def checked_drive(problem: Problem, drive: Drive, tolerance: float) -> Plan:
 
 @eqx.filter_jit
 def seen_along(
-    dynamics: Dynamics, footprint: Footprint, drive: Drive, times: Numbers, states: Float[Array, "times n"]
-) -> tuple[Corners, Numbers, Numbers]:
+    dynamics: Dynamics, footprint: Footprint, drive: Drive, times: Number, states: Float[Array, "times n"]
+) -> tuple[Corners, Number, Number]:
     """The corners [m] of the footprint, the force [N] and the torque [N m] of a drive along a run."""
     corners = corners_of(dynamics, footprint, states.T[: 2 * dynamics.surface.axes])
     return corners, *drive(times, dynamics.geometry(states.T).motion)

@@ -18,7 +18,7 @@ from nonholonomic.terminal import Progress, status_line
 from nonholonomic.text import likely, shown
 from nonholonomic.validation import explaining, require, require_flag, require_kind, require_package, require_whole
 
-from ..model.dynamics import Dynamics, Numbers, padded
+from ..model.dynamics import Dynamics, Number, padded
 from ..model.scene import Scene
 from .problem import FAR, FROM_ABOVE, SQUARE, Pose, checked_problem, frame_of
 from .transcription import ORDER, Task, drive_from, motion_at, point_residuals, windows
@@ -40,7 +40,7 @@ OTHER_WHEELBASE = 0.1
 #: Neurons of the layers that see an obstacle and of those that decide.
 SEEING, DECIDING = 32, 128
 
-#: Numbers that are seen of an obstacle: its four corners.
+#: Number that are seen of an obstacle: its four corners.
 CORNERS = 8
 
 #: Weights of a missed goal, of broken constraints and of the effort.
@@ -130,7 +130,7 @@ class Planner(eqx.Module):
         parts = [jnp.stack([*lengths, *turned]), known, *own, each.sum(axis=0), each.max(axis=0, initial=0.0)]
         return self.of_step(jnp.concatenate(parts).astype(jnp.float32)).astype(float)
 
-    def propose(self, task: Task, number: Int[Array, ""]) -> tuple[Numbers, Proposal]:
+    def propose(self, task: Task, number: Int[Array, ""]) -> tuple[Number, Proposal]:
         """One of the proposals for a problem, and its merit before it."""
         pose, steering, steering_rate, front_speed = task.start
         duration, change = task.t1 / DECISIONS, jnp.array([-1.0, 0.0, 1.0])
@@ -166,7 +166,7 @@ class Planner(eqx.Module):
         return jax.vmap(functools.partial(self.propose, task))(jnp.arange(PROPOSALS))
 
 
-def merit(task: Task, proposal: Proposal) -> Numbers:
+def merit(task: Task, proposal: Proposal) -> Number:
     """How far a proposal is from solving a problem: the weighted squares of what it misses, breaks and spends."""
 
     def at(pose, window, part):
@@ -213,6 +213,9 @@ BATCH, DRAWING, RISE, RATE = 64, 0.2, 50, 1e-3
 #: Weight of the mean of all proposals beside the best one, without which some of them would never learn.
 SHARE = 0.05
 
+#: A random problem: the arguments of `plan` by their names.
+Problems = Callable[[np.random.Generator], dict[str, Any]]
+
 #: The arguments of `plan` that a problem consists of.
 TASK_PARTS = ("launch", "goal", "t1", "obstacles", "limits", "footprint")
 
@@ -222,12 +225,7 @@ NEEDED = ("launch", "goal", "t1")
 
 @explaining
 def learn_planner(
-    scene: Scene,
-    problems: Callable[[np.random.Generator], dict[str, Any]],
-    *,
-    seconds: float = 600.0,
-    seed: int = 0,
-    progress: bool = True,
+    scene: Scene, problems: Problems, *, seconds: float = 600.0, seed: int = 0, progress: bool = True
 ) -> Planner:
     """Train a network to propose drives, on random problems and through the simulation itself (needs optax).
 
@@ -288,9 +286,7 @@ def learn_planner(
         return trained(planner, tasks, random, (1.0 - DRAWING) * seconds, progress)
 
 
-def drawn_task(
-    scene: Scene, problems: Callable[[np.random.Generator], dict[str, Any]], random: np.random.Generator, number: int
-) -> Task:
+def drawn_task(scene: Scene, problems: Problems, random: np.random.Generator, number: int) -> Task:
     """A random problem as the optimiser needs it; `number` names the draw in messages."""
     parts: object = problems(random)
     try:
@@ -312,7 +308,7 @@ def drawn_task(
 def loss(planner: Planner, dynamics: Dynamics, tasks: Task) -> Float[Array, ""]:
     """What learning minimises: the mean over all problems of the merit of the best proposal, on a logarithmic scale."""
 
-    def of_one(task: Task) -> Numbers:
+    def of_one(task: Task) -> Number:
         values = jnp.log1p(planner.proposals(dataclasses.replace(task, dynamics=dynamics))[0])
         return values.min() + SHARE * values.mean()
 

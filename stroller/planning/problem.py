@@ -10,22 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from nonholonomic import validation
 from nonholonomic.geometry import AbstractSurface, Plane, Vector, cross, difference, dot, scale, sum_vectors
 from nonholonomic.integration.problem import require_run
 from nonholonomic.text import shown
-from nonholonomic.validation import (
-    Bound,
-    Bounded,
-    Usual,
-    as_number,
-    is_traced,
-    largest,
-    require,
-    require_all,
-    require_kind,
-    require_scalars,
-    warn,
-)
+from nonholonomic.validation import Bound, Bounded, Usual, as_number, require, require_kind
 
 from ..model.dynamics import Dynamics, padded
 from ..model.scene import HEADING, STEERING, Launch, Scene, as_numbers, as_place
@@ -362,7 +351,7 @@ def as_range(value: Any) -> Any:
     if isinstance(numbers, tuple) or value is None:
         return numbers
     bound = as_number(value)
-    return (-bound, bound) if isinstance(bound, Array) and (is_traced(bound) or bound > 0.0) else value
+    return (-bound, bound) if isinstance(bound, Array) and (validation.is_traced(bound) or bound > 0.0) else value
 
 
 #: A grip above 5 suggests per cent.
@@ -406,7 +395,7 @@ class Limits(Bounded):
         pairs = {name: getattr(self, name) for name in self.units if getattr(self, name) is not None}
         for name, value in pairs.items():
             if not (isinstance(value, tuple) and len(value) == 2):
-                bound = f"{(largest(as_number(value)) if np.ndim(value) == 0 else 0.0) or 1.0:g}"
+                bound = f"{(validation.largest(as_number(value)) if np.ndim(value) == 0 else 0.0) or 1.0:g}"
                 words = f"one positive number, such as {bound} for (-{bound}, {bound}), or a pair (lowest, highest)"
                 raise ValueError(f"{name} = {shown(value)} must be {words}")
         yield from super().bounds()
@@ -703,7 +692,7 @@ def checked_problem(
     if scene.heading == "projected" and not isinstance(scene.surface, Plane):
         raise ValueError("heading = 'projected' must be 'intrinsic' for a plan on a curved ground")
     require_kind(goal, "goal", Goal)
-    require_scalars(
+    validation.require_scalars(
         {f"goal.{name}": getattr(goal, name) for name in ("heading", "speed", "within")}, "plan one goal at a time"
     )
     limits = Limits() if limits is None else limits
@@ -715,7 +704,7 @@ def checked_problem(
     centres = {f"obstacles[{number}]": part.centre for number, part in enumerate(problem.obstacles)}
     for name, place in {"goal": goal.place, **centres}.items():
         try:
-            require_all(scene.surface.place_bounds(place, scene.body.wheelbase))
+            validation.require_all(scene.surface.place_bounds(place, scene.body.wheelbase))
         except ValueError as error:
             remark = "; a heading is an argument of its own, heading=" if name == "goal" and len(place) == 3 else ""
             raise ValueError(f"{name}: {error}{remark}") from None
@@ -727,7 +716,7 @@ def checked_problem(
     # A limit of the speed is checked by the plan.
     is_free = not in_haste and limits.speed is None
     if is_free and (speed := problem.distance / duration) > FASTEST:
-        warn(
+        validation.warn(
             f"goal: place = {shown(goal.place)} is {problem.distance:.0f} m from the launch, a mean speed of {speed:.3g} m/s: "
             "was it in cm or mm? Or take a longer t1"
         )

@@ -20,7 +20,7 @@ from scipy.interpolate import make_interp_spline
 
 from nonholonomic.geometry import AbstractSurface, Vector, add, cross, difference, dot, multiply, scale, subtract
 
-from ..model.dynamics import Dynamics, Numbers, padded
+from ..model.dynamics import Dynamics, Number, padded
 from ..model.input import Motion
 from .problem import LIMIT_RESERVE, Footprint, Obstacles, Pose, Problem, corners_of, frame_of
 
@@ -36,21 +36,21 @@ Splines: TypeAlias = Float[Array, "rows 2"]
 class Rates(NamedTuple):
     """Steering angle phi [rad], its two derivatives, and speed of the front wheel [m/s] and its derivative."""
 
-    steering: Numbers
-    steering_rate: Numbers
-    steering_acceleration: Numbers
-    front_speed: Numbers
-    front_acceleration: Numbers
+    steering: Number
+    steering_rate: Number
+    steering_acceleration: Number
+    front_speed: Number
+    front_acceleration: Number
 
 
 class Actuation(NamedTuple):
     """What a motion needs: force [N], torque [N m], speed of the rear axle [m/s], normal force [N] and, if asked for,
     the coefficient of friction of each loaded axle."""
 
-    force: Numbers
-    torque: Numbers
-    speed: Numbers
-    normal_force: Numbers
+    force: Number
+    torque: Number
+    speed: Number
+    normal_force: Number
     grip: Float[Array, " axles"]
 
 
@@ -59,7 +59,7 @@ def actuation(dynamics: Dynamics, pose: Pose, rates: Rates, with_grip: bool) -> 
     components, body = len(pose), dynamics.body
     values = (pose, rates.steering, rates.steering_rate, rates.front_speed)
 
-    def state_of(pose: Pose, steering: Numbers, steering_rate: Numbers, front_speed: Numbers) -> Numbers:
+    def state_of(pose: Pose, steering: Number, steering_rate: Number, front_speed: Number) -> Number:
         return dynamics.state(*frame_of(dynamics, pose)[:2], steering, steering_rate, front_speed)
 
     state = state_of(*values)
@@ -91,7 +91,7 @@ def actuation(dynamics: Dynamics, pose: Pose, rates: Rates, with_grip: bool) -> 
 ORDER = 4
 
 
-def basis(u: Numbers | float) -> tuple[list[Numbers | float], list[Numbers | float], list[Numbers | float]]:
+def basis(u: Number | float) -> tuple[list[Number | float], list[Number | float], list[Number | float]]:
     """The weights of an interval's four coefficients at a part `u` of it, in [0, 1], and their first and second
     derivatives."""
     v = 1.0 - u
@@ -101,13 +101,13 @@ def basis(u: Numbers | float) -> tuple[list[Numbers | float], list[Numbers | flo
     return value, slope, bend
 
 
-def weighted(weights: list[Numbers | float], coefficients: Numbers | list[Numbers]) -> Numbers:
+def weighted(weights: list[Number | float], coefficients: Number | list[Number]) -> Number:
     """The sum of four coefficients, along axis 0, with weights."""
     a, b, c, d = weights
     return a * coefficients[0] + b * coefficients[1] + c * coefficients[2] + d * coefficients[3]
 
 
-def evaluate_spline(coefficients: Numbers, part: Numbers | float, derivative: int = 0) -> Numbers:
+def evaluate_spline(coefficients: Number, part: Number | float, derivative: int = 0) -> Number:
     """The value of a spline, or of its derivative, at parts of its whole length, held constant beyond its ends.
 
     Derivatives are with respect to the number of intervals passed.
@@ -118,7 +118,7 @@ def evaluate_spline(coefficients: Numbers, part: Numbers | float, derivative: in
 # Every run of a plan traces its input several times; `jit` keeps the trace. By its name, the search for jumps knows that it
 # is smooth.
 @partial(jax.jit, static_argnames="derivative")
-def spline_of_a_plan(coefficients: Numbers, part: Numbers | float, derivative: int) -> Numbers:
+def spline_of_a_plan(coefficients: Number, part: Number | float, derivative: int) -> Number:
     """As `evaluate_spline`, for parts between 0 and 1."""
     intervals = len(coefficients) - ORDER + 1
     position = part * intervals
@@ -206,17 +206,17 @@ class Task(eqx.Module):
 class Residuals(NamedTuple):
     """Residuals of an interval: equalities, inequalities (at least 0) and the objective, in the units of the task."""
 
-    equalities: Numbers
-    inequalities: Numbers
-    objective: Numbers
+    equalities: Number
+    inequalities: Number
+    objective: Number
 
 
 def drive_from(
-    dynamics: Dynamics, pose: Pose, window: Splines, part: Numbers | float, step: float, duration: Numbers
+    dynamics: Dynamics, pose: Pose, window: Splines, part: Number | float, step: float, duration: Number
 ) -> Pose:
     """The pose a step later, by the classical Runge-Kutta method; `part` and `step` in units of the interval."""
 
-    def rate(u: Numbers | float, pose: Pose) -> Pose:
+    def rate(u: Number | float, pose: Pose) -> Pose:
         steering, front_speed = weighted(basis(u)[0], window)
         state = dynamics.state(*frame_of(dynamics, pose)[:2], steering, jnp.zeros(()), front_speed)
         return duration * dynamics.field(jnp.zeros(()), state)[: len(pose)]
@@ -228,7 +228,7 @@ def drive_from(
     return pose + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
-def motion_at(window: Splines, part: Numbers | float, duration: Numbers) -> Rates:
+def motion_at(window: Splines, part: Number | float, duration: Number) -> Rates:
     """The steering and the speed at a part of an interval that takes `duration` [s]."""
     value, slope, bend = (weighted(weights, window) for weights in basis(part))
     rate, acceleration = slope / duration, bend[..., 0] / duration**2
@@ -250,7 +250,7 @@ def point_residuals(task: Task, pose: Pose, motion: Rates) -> tuple[Float[Array,
 
 
 def interval_residuals(
-    window: Float[Array, "4 unknowns"], task: Task, index: Int[Array, ""], intervals: int, duration: Numbers
+    window: Float[Array, "4 unknowns"], task: Task, index: Int[Array, ""], intervals: int, duration: Number
 ) -> Residuals:
     """All residuals of the interval `index` of `intervals`."""
     poses, splines = window[:, :-2], window[:, -2:]
@@ -337,7 +337,7 @@ Multipliers: TypeAlias = tuple[
 
 @eqx.filter_jit
 def _of_lane(
-    unknowns: Float[Array, "rows unknowns"], t1: Numbers, task: Task, multipliers: Multipliers, penalty: Numbers
+    unknowns: Float[Array, "rows unknowns"], t1: Number, task: Task, multipliers: Multipliers, penalty: Number
 ) -> Equations:
     """The equations of a step from one candidate.
 
@@ -503,7 +503,7 @@ class Drive(eqx.Module):
     angle_gain: Float[Array, ""]
     rate_gain: Float[Array, ""]
 
-    def reference(self, t: Numbers) -> tuple[Numbers, Numbers, Numbers, Numbers, Numbers]:
+    def reference(self, t: Number) -> tuple[Number, Number, Number, Number, Number]:
         """Planned steering angle [rad], its rate [rad/s], speed of the front wheel [m/s], force [N] without the weight's
         part, and torque [N m]."""
         part = jnp.asarray(t) / self.duration
@@ -513,8 +513,8 @@ class Drive(eqx.Module):
         return angle, rate, speed, force, torque
 
     def held(
-        self, motion: Motion, angle: Numbers, rate: Numbers, speed: Numbers, force: Numbers, torque: Numbers
-    ) -> tuple[Numbers, Numbers]:
+        self, motion: Motion, angle: Number, rate: Number, speed: Number, force: Number, torque: Number
+    ) -> tuple[Number, Number]:
         """Force and torque that hold a steering angle, its rate and the speed of the front wheel, from the planned force and
         torque."""
         # No weight acts against the heading where the ground is level.
@@ -523,20 +523,20 @@ class Drive(eqx.Module):
         torque = torque + self.angle_gain * (angle - motion.steering) + self.rate_gain * (rate - motion.steering_rate)
         return force, torque
 
-    def __call__(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers]:
+    def __call__(self, t: Number, motion: Motion) -> tuple[Number, Number]:
         return self.held(motion, *self.reference(t))
 
 
 @eqx.filter_jit
 def _needed(
-    dynamics: Dynamics, pose: Pose, splines: Splines, t1: Numbers
+    dynamics: Dynamics, pose: Pose, splines: Splines, t1: Number
 ) -> tuple[Float[Array, " fine"], Float[Array, " fine"], Vector]:
     """Force without the weight's part and torque of a drive from a pose, `FINE` times in every interval and at the end; and
     the weight."""
     intervals = len(splines) - ORDER + 1
     duration, weight = t1 / intervals, scale(dynamics.body.mass * dynamics.gravity, dynamics.up)
 
-    def step(pose: Pose, k: Int[Array, ""]) -> tuple[Pose, tuple[Numbers, Numbers]]:
+    def step(pose: Pose, k: Int[Array, ""]) -> tuple[Pose, tuple[Number, Number]]:
         first = jnp.minimum(k // FINE, intervals - 1)
         window, part = jax.lax.dynamic_slice_in_dim(splines, first, ORDER), k / FINE - first
         needed = actuation(dynamics, pose, motion_at(window, part, duration), False)
@@ -578,7 +578,7 @@ class Tracker(eqx.Module):
     slow: Float[Array, ""]
     side: float = eqx.field(static=True)
 
-    def errors(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+    def errors(self, t: Number, motion: Motion) -> tuple[Number, Number, Number, Number]:
         """The planned stroller as seen from this one: distances [m] ahead and to the left, and the sine and the cosine of
         the angle to the left at which it heads."""
         pose = evaluate_spline(self.pose, jnp.asarray(t) / self.drive.duration)
@@ -589,12 +589,12 @@ class Tracker(eqx.Module):
         away = difference(target, motion.position)
         return dot(away, motion.heading), dot(away, left), dot(heading, left), dot(heading, motion.heading)
 
-    def storage(self, t: Numbers, motion: Motion) -> Numbers:
+    def storage(self, t: Number, motion: Motion) -> Number:
         """The shaped energy of the errors of place and heading [m^2]: (x^2 + y^2) / 2 + (1 - cos(angle)) / stiffness."""
         ahead, left, _, cosine = self.errors(t, motion)
         return 0.5 * (ahead**2 + left**2) + (1.0 - cosine) / self.across
 
-    def __call__(self, t: Numbers, motion: Motion) -> tuple[Numbers, Numbers]:
+    def __call__(self, t: Number, motion: Motion) -> tuple[Number, Number]:
         angle, rate, front_speed, force, torque = self.drive.reference(t)
         ahead, left, sine, cosine = self.errors(t, motion)
         speed = front_speed * jnp.cos(angle)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from nonholonomic import validation
 from nonholonomic.geometry import AbstractSurface, Component, Cylinder, Plane, Sphere, Torus, Vector
 from nonholonomic.geometry.frames import AbstractFrame, PlaneFrame, frame_of, place_named
 from nonholonomic.geometry.surface import as_surface
@@ -18,18 +19,7 @@ from nonholonomic.geometry.vector import cross, dot, none_if_zero, scale, sum_ve
 from nonholonomic.integration import Components, States
 from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import Stated, likely_fix, shown
-from nonholonomic.validation import (
-    Bound,
-    Bounded,
-    Usual,
-    as_number,
-    explaining,
-    largest,
-    require,
-    require_all,
-    require_kind,
-    warn,
-)
+from nonholonomic.validation import Bound, Bounded, Usual, as_number, largest, require
 
 from ..friction import A_LAW, AbstractFriction, Frictionless, NoSlip, SetValuedCoulomb, as_law
 from .body import AbstractBody, Top
@@ -120,7 +110,7 @@ class Launch(Stated, Bounded):
     )
 
     @classmethod
-    @explaining
+    @validation.explaining
     def degrees(
         cls, theta: ArrayLike, rpm: ArrayLike, *, eta: ArrayLike = 0.0, azimuth: ArrayLike = 0.0, **others: Any
     ) -> "Launch":
@@ -152,7 +142,7 @@ class Launch(Stated, Bounded):
         require(azimuth, "azimuth", why="in degrees")
         require(rpm, "rpm")
         if 0.0 < (inclination := largest(as_number(theta))) < LEAST_DEGREES:
-            warn(
+            validation.warn(
                 f"theta = {inclination:g} deg is closer to upright than a hand can launch a top: was it in radians? "
                 f"{inclination:g} rad are {math.degrees(inclination):.3g} deg"
             )
@@ -249,8 +239,8 @@ class Scene(Bounded, Generic[Body]):
         if not isinstance(body, AbstractBody | AbstractRigidBody):
             kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{likely_fix(body)}"
             raise ValueError(f"body = {shown(body)} must be {kinds}")
-        require_kind(surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
-        require_kind(friction, "friction", AbstractFriction, A_LAW)
+        validation.require_kind(surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
+        validation.require_kind(friction, "friction", AbstractFriction, A_LAW)
         # This raises an error if the surface has no such side.
         surface.sign(self.side, "inside")
         if self.contact not in ("stop", "hybrid"):
@@ -374,7 +364,7 @@ class Scene(Bounded, Generic[Body]):
 
     def check_start(self, launch: Launch) -> None:
         """Raise `ValueError` if a launch has no place on this arena."""
-        require_all(self.start_bounds(launch))
+        validation.require_all(self.start_bounds(launch))
 
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
         """The ranges of a launch's numbers on this arena.
