@@ -291,7 +291,7 @@ def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeyp
     message = (
         r"t1 = 100000 s is too long: the run needs more than 40 steps, which reached only 0\.\d+ s; take a shorter t1"
     )
-    with pytest.raises(ValueError, match=message):
+    with pytest.warns(UserWarning, match="long for a top"), pytest.raises(ValueError, match=message):
         tippe.inversion_time(TOP, LAUNCH, 1e5, tolerance=1e-6)
 
 

@@ -195,13 +195,14 @@ FARTHEST = 10.0
 
 
 class Region(NamedTuple):
-    """A box in the coordinates: the middle and the half widths of the search, each (unknowns,)."""
+    """A box in the coordinates: the middle and the half widths of the search, and the start values, each (unknowns,)."""
 
     middle: Coordinates
     half_width: Coordinates
+    start: Coordinates
 
     def points(self, count: int, seed: int) -> Float[np.ndarray, "count unknowns"]:
-        """Quasi-random points that fill the box; the first is the middle.
+        """Quasi-random points that fill the box; the first is the start.
 
         Source: Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018): multiples of powers of the root of
         x^(d + 1) = x + 1 for d unknowns, here with a random shift. Importing SciPy's Sobol points takes seconds.
@@ -210,8 +211,9 @@ class Region(NamedTuple):
         root = np.roots([1.0, *np.zeros(size - 1), -1.0, -1.0]).real.max()
         shift, steps = np.random.default_rng(seed).uniform(size=size), root ** -np.arange(1.0, size + 1.0)
         unit = (shift + np.outer(np.arange(count), steps)) % 1.0
-        unit[0] = 0.5
-        return self.middle + (2.0 * unit - 1.0) * self.half_width
+        points = self.middle + (2.0 * unit - 1.0) * self.half_width
+        points[0] = np.clip(self.start, self.middle - self.half_width, self.middle + self.half_width)
+        return points
 
     def log_density(self, points: Points) -> PerPoint:
         """The log density of points that are uniform in the box."""
@@ -265,7 +267,7 @@ def region_of(density: LogDensity, spread: float) -> Region:
         [unknowns.coordinates(np.stack([low, high])), np.array([[-5.0], [5.0]])],
         unknowns.coordinates(start) + by_factor,
     )
-    return Region(np.mean(ends, axis=0), 0.5 * np.ptp(ends, axis=0))
+    return Region(np.mean(ends, axis=0), 0.5 * np.ptp(ends, axis=0), np.asarray(unknowns.coordinates(start)))
 
 
 #: Greatest number of points that are evaluated together, and of points in a round; the program of the priors has as many rows.

@@ -442,7 +442,7 @@ def search(explorer: Explorer, starts: int, max_steps: int) -> tuple[Explorer, M
         at_best = weighed(density, best, sample.predictions[place], slopes)
         return explorer, Minima(best, np.array([True]), at_best, density), sample
     # The start; then, in turn, the best for all measurements and for the early ones.
-    start = int(np.argmin(np.sum((pool.points - explorer.region.middle) ** 2, axis=1)))
+    start = int(np.argmin(np.sum((pool.points - explorer.region.points(1, 0)) ** 2, axis=1)))
     totals = np.cumsum(pool.groups, axis=1) + pool.log_prior[:, None]
     columns = sorted({totals.shape[1] - 1, *(totals.shape[1] * part // 8 for part in (0, 1, 2, 4))}, reverse=True)
     ranked = np.stack([np.argsort(-totals[:, column]) for column in columns], axis=1).reshape(-1)

@@ -552,7 +552,8 @@ def even_steps(
         if validation.is_traced(number):
             raise ValueError(f"{name} is traced and must be known for ImplicitMidpoint, whose steps are fixed")
     known_jumps = np.zeros(0) if jumps is None or validation.is_traced(jumps) else np.asarray(jumps)
-    inside = known_jumps[(known_jumps > 0.0) & (known_jumps < t1)]
+    # Inside of `jit`, a comparison with an array of JAX would be traced.
+    inside = known_jumps[(known_jumps > 0.0) & (known_jumps < float(t1))]
     knots = np.union1d(np.append(np.asarray(times), inside), [0.0, float(t1)])
     counts = np.ceil(np.diff(knots) / float(max_duration) * (1.0 - 1e-12)).astype(int)
     pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]

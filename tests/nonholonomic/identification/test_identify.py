@@ -260,3 +260,16 @@ def test_the_verdict_tells_that_an_estimate_is_outside_of_the_searched_range():
 def test_a_model_without_predictions_is_reported():
     with pytest.raises(ValueError, match=r"no start led to finite predictions: simulate .* falls through zero"):
         identify(lambda numbers: jnp.nan * line(numbers), Measurements(X, ERROR), {"height": 0.5, "slope": 0.0})
+
+
+def test_a_fit_between_bounds_is_no_worse_than_its_start():
+    """A valley so narrow that none of the candidates between the bounds lies in it."""
+
+    def valley(p):
+        off = jnp.stack([(p["a"] - 63.21) / 0.01, (p["b"] - 0.37) / 1e-4], axis=1)
+        return 20.0 * jnp.tanh(off)
+
+    free = {"a": Free(63.215, 0.0, 100.0), "b": Free(0.37, 0.0, 1.0)}
+    fit = identify(valley, Measurements([0.0, 0.0], 1.0), free, progress=False)
+    assert_close([fit.estimates["a"], fit.estimates["b"]], [63.21, 0.37], rtol=1e-6)
+    assert fit.deviance < 1e-6
