@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import jax
 
 from .compilation.cache import forget_programs_if_many, is_off
+from .compilation.xla_cpu import on_cpu
 
 #: How often the line is written [s] (a shorter call shows nothing), how often the thread checks whether the line is due
 #: [s], and how long the thread waits for another call [s]: starting a thread for every call would cost short calls a
@@ -182,10 +183,10 @@ class Progress:
 @contextmanager
 def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
     """Show a status line while a call compiles; also a decorator for functions. First clear programs that take too much
-    memory (`compilation/cache.py`).
+    memory (`compilation/cache.py`). The call runs on the CPU.
     """
     forget_programs_if_many()
-    with Progress(None, doing=doing, shown=shown) as line:
+    with on_cpu(), Progress(None, doing=doing, shown=shown) as line:
         yield line
 
 

@@ -24,11 +24,12 @@ HEIGHT = {
     "integration": 0,
     "derivatives": 1,
     "hybrid": 2,
-    "views": 3,
-    "sweeps": 4,
-    "identification": 5,
-    "runs": 6,
-    "systems": 7,
+    "kernels": 3,
+    "views": 4,
+    "sweeps": 5,
+    "identification": 6,
+    "runs": 7,
+    "systems": 8,
 }
 
 #: The same for the rooms of a vehicle.
@@ -39,7 +40,7 @@ MOST_LINES = 450
 MOST_FILES_OUTSIDE = 6
 
 #: The size of the three packages: it may shrink. Imports are a share of the lines of code.
-MOST = {"files": 112, "lines": 25_467, "functions": 2552, "Any": 486, "imports": 0.0850}
+MOST = {"files": 117, "lines": 25_830, "functions": 2592, "Any": 509, "imports": 0.0853}
 
 
 class Arrow(NamedTuple):

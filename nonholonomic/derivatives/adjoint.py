@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..compilation.xla_cpu import compiled_alone, uncounted, written_by_component, written_in_place
+from ..compilation.xla_cpu import compiled_alone, current_platform, uncounted, written_by_component, written_in_place
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, time_at_jump
 from ..integration.runge_kutta import Integers, Stages, inner_stages, moved_state, over_stages
@@ -109,7 +109,7 @@ class LatestSteps(NamedTuple):
         """No steps. **Arguments:** `example`: the steps of a period, for the shapes; `cells`: number of cells."""
         period, lanes = example.length.shape
         bytes_of_step = sum(leaf.dtype.itemsize * leaf.size for leaf in jax.tree.leaves(example)) // period
-        max_steps = MAX_BYTES.get(jax.default_backend(), 1 << 31) // bytes_of_step
+        max_steps = MAX_BYTES.get(current_platform(), 1 << 31) // bytes_of_step
         size = period + max(period, min(max_steps, STEPS_KEPT * -(-cells // lanes)))
         room = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape[1:]), leaf.dtype), example)
         return cls(jnp.zeros((), int), room)
@@ -592,11 +592,19 @@ def ensemble_solve_with_tangents(
         ended, slopes = slopes_by_variations(problem, tangents, not nonterminal, options, one_kernel)
     if not nonterminal:
         outcome = with_crossing_times(problem, ended)
+    return outcome, [slope_of_event(outcome, ended, slope, nonterminal) for slope in slopes]
+
+
+def slope_of_event(
+    outcome: Outcome, ended: Outcome, slope: Float[Array, " cells"], nonterminal: bool
+) -> Float[Array, " cells"]:
+    """The derivative of the time of an event: 0 without one, and NaN if it is unknown. **Arguments:** `outcome`, `ended`: of
+    the runs, without and with their variations; `slope`: as from `slopes_by_variations`."""
     # An event at the start has a fixed time, whatever the tangent.
     has_delay = jnp.isfinite(outcome.crossing_time) & (ended.end_time > 0.0)
     # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
     arrived = ended.status == (REACHED_END if nonterminal else CROSSED)
-    return outcome, [jnp.where(has_delay, jnp.where(arrived, slope, jnp.nan), 0.0) for slope in slopes]
+    return jnp.where(has_delay, jnp.where(arrived, slope, jnp.nan), 0.0)
 
 
 _alone, _in_program = compiled_alone(ensemble_solve_with_tangents), eqx.filter_jit(ensemble_solve_with_tangents)

@@ -291,18 +291,23 @@ def slopes_by_variations(
         # steps would become too long for the tangent.
         blocks = 1 + len(group)
         ended = LaneScheduler.of(variational, *options, n_blocks=blocks, one_kernel=one_kernel).solve()[0]
-        state, *variations = variational.parts(ended.state)
-
-        def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-            return crossing_time(problem, ended.end_time, state)
-
-        slopes = [
-            eqx.filter_jvp(event_time, (problem, state), direction)[1]
-            for direction in zip(group, variations, strict=True)
-        ]
-        return ended._replace(state=state), slopes
+        return slopes_at_event(variational, ended)
 
     return in_groups(run, tangents)
+
+
+def slopes_at_event(variational: VariationalProblem, ended: Outcome) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """The result of `slopes_by_variations`, from that of runs with their variations."""
+    state, *variations = variational.parts(ended.state)
+
+    def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return crossing_time(problem, ended.end_time, state)
+
+    slopes = [
+        eqx.filter_jvp(event_time, (variational.problem, state), direction)[1]
+        for direction in zip(variational.tangents, variations, strict=True)
+    ]
+    return ended._replace(state=state), slopes
 
 
 def in_groups(run: Callable[..., tuple[PyTree, list[PyTree]]], tangents: Tangents) -> tuple[PyTree, list[PyTree]]:

@@ -276,6 +276,7 @@ def solve_hybrid_with_tangents(
     counters: int,
     ends_on_event: bool = True,
     traced: bool = False,
+    solve: Callable[..., HybridOutcome] | None = None,
 ) -> tuple[HybridOutcome[Numbers], Slopes[Numbers]]:
     """Run every cell through its modes to its event, and differentiate the event's time along tangents.
 
@@ -285,6 +286,7 @@ def solve_hybrid_with_tangents(
       move.
     - `ends_on_event`: whether runs end on the event; otherwise they end at `t1`, which then counts as the event's time.
     - `traced`: whether numbers may be traced; then arguments and results are JAX's arrays.
+    - `solve`: runs the cells with one tangent at a time, by default `solve_hybrid` with all of them.
 
     **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event or the event is at the start.
     Source: implicit function theorem at the event, saltation at every change of mode.
@@ -302,8 +304,9 @@ def solve_hybrid_with_tangents(
 
     def run(group: Tangents) -> tuple[PyTree, list[Float[Numbers, " cells"]]]:
         variational, start = with_variations(modes, jnp.asarray(state), group, settings.tolerance, ends_on_event)
-        options = {"counters": counters + 1, "n_blocks": 1 + len(group), "traced": traced}
-        ended = solve_hybrid(variational, mode, xp.asarray(start), t1, cells, settings, **options)
+        arguments = (variational, mode, xp.asarray(start), t1, cells, settings)
+        options: dict[str, Any] = {"counters": counters + 1, "n_blocks": 1 + len(group)}
+        ended = solve_hybrid(*arguments, **options, traced=traced) if solve is None else solve(*arguments, **options)
         # A run that has ended between two modes is in neither. Its event is the end of the previous mode, whose variation is
         # the last row.
         slopes = xp.reshape(ended.state, (1 + len(group), -1, len(ended.mode)))[1:, -1]
@@ -318,7 +321,12 @@ def solve_hybrid_with_tangents(
         slopes = xp.where(has_event, xp.where(grazing, xp.nan, slopes), 0.0)
         return (ended._replace(state=ended.state[:size], counts=ended.counts[:-1]), grazing), list(slopes)
 
-    (outcome, grazing), slopes = in_groups(run, tangents) if traced else run(tangents)
+    if solve is not None:
+        parts = [run((tangent,)) for tangent in tangents]
+        (outcome, _), slopes = parts[0][0], [slope for _, (slope,) in parts]
+        grazing = np.any([grazing for (_, grazing), _ in parts], axis=0)
+    else:
+        (outcome, grazing), slopes = in_groups(run, tangents) if traced else run(tangents)
     return outcome, Slopes(xp.stack(slopes), grazing)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from ..compilation.xla_cpu import current_platform
 from ..sweeps.running import workers
 from ..terminal import status_line
 from ..text import in_unit, readable_unit, shown
@@ -510,7 +511,7 @@ def _in_parts(
     The program is compiled for a fixed number of rows. Runs of rows of NaN end at once.
     """
     cores = workers()
-    rows = rows_of_part if jax.default_backend() == "cpu" else MOST_ROWS
+    rows = rows_of_part if current_platform() == "cpu" else MOST_ROWS
     padding = np.full((-len(coordinates) % rows, coordinates.shape[1]), np.nan)
     parts = np.concatenate([coordinates, padding]).reshape(-1, rows, coordinates.shape[1])
     with ThreadPoolExecutor(cores) as threads:

@@ -18,7 +18,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..compilation.xla_cpu import traced_once
+from ..compilation.xla_cpu import current_platform, traced_once
 from ..parameters import numbers
 from ..text import shown
 from ..validation import (
@@ -478,6 +478,7 @@ class Settings(eqx.Module):
     - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
     - `max_steps`: a run that needs more steps fails.
     - `lanes`: number of cells that advance together; by default as many as suit the machine (`lanes_for`).
+    - `device`: where tables run, "cpu" or "gpu"; by default on a GPU if there is one and they are large.
 
     **Example:**
 
@@ -491,6 +492,7 @@ class Settings(eqx.Module):
     absolute: float = eqx.field(static=True, default=ABSOLUTE)
     max_steps: int = eqx.field(static=True, default=DEFAULT_MAX_STEPS)
     lanes: int | None = eqx.field(static=True, default=None)
+    device: str | None = eqx.field(static=True, default=None)
 
     @property
     def for_lanes(self) -> diffrax.AbstractSolver:
@@ -527,7 +529,7 @@ def lanes_for(cells: int) -> int:
     power of 2, are partly computed one by one. This matters more than the caches: also with variations, 64 lanes are
     the fastest. An accelerator needs tens of thousands of lanes.
     """
-    max_lanes = 64 if jax.default_backend() == "cpu" else 32768
+    max_lanes = 64 if current_platform() == "cpu" else 32768
     return min(max_lanes, 1 << (cells - 1).bit_length())
 
 

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..compilation.xla_cpu import traced_once, written_by_component, written_in_place
+from ..compilation.xla_cpu import current_platform, traced_once, written_by_component, written_in_place
 from ..text import shown
 
 Lanes = Float[Array, "*lanes"]
@@ -210,7 +210,7 @@ def over_stages(stages: int, do: Callable[[Int[Array, ""], Carry], Carry], start
     """Loop over the stages and return the carry; on an accelerator, which would wait for the host at every branch, the
     loop is unrolled.
     """
-    return jax.lax.fori_loop(0, stages, do, start, unroll=jax.default_backend() != "cpu")
+    return jax.lax.fori_loop(0, stages, do, start, unroll=current_platform() != "cpu")
 
 
 def stages_to_look(fractions: Float[np.ndarray, " stages"]) -> list[int]:

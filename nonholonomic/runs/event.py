@@ -5,6 +5,7 @@ differentiated. If the function depends on time, a clock is added to the state.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -22,6 +23,7 @@ from ..hybrid import AbstractBatchedMode, HybridOutcome, Transition, solve_hybri
 from ..hybrid.saltation import UNMEASURED, Clock
 from ..integration import AbstractProblem, ExtendedProblem, Lanes, Outcome, Settings, States, solve_ensemble
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_run
+from ..kernels import by_kernel, solve_in_modes, solve_smooth, solve_smooth_with_tangents
 from ..parameters import Parameters
 from ..terminal import status_line
 from ..text import described, gathered, likely, shown
@@ -320,12 +322,16 @@ class Ensemble(eqx.Module):
         **Arguments:** `t1`: horizon [s]; `cells`: number of cells to run, the rest is padding; `traced`: whether numbers
         may be traced.
         """
+        device, options = "cpu" if traced else settings.device, {"nonterminal": self.continues}
         if self.problem is not None:
             arguments = (self.problem, jnp.asarray(t1), jnp.asarray(cells), settings)
-            return solve_ensemble(*arguments, nonterminal=self.continues, one_kernel=True, traced=traced)[0]
-        modes, first, states = self.start
-        options = {"counters": self.counters, "nonterminal": self.continues, "traced": traced}
-        return solve_hybrid(modes, first, states, t1, cells, settings, **options)
+            outcome = by_kernel(lambda gpu: solve_smooth(*arguments, **options, run=gpu), self.capacity, device)
+            solve = functools.partial(solve_ensemble, *arguments, one_kernel=True, traced=traced)
+            return solve(**options)[0] if outcome is None else outcome
+        solve = functools.partial(solve_hybrid, *self.start, t1, cells, settings, counters=self.counters, **options)
+        by_gpu = functools.partial(solve_in_modes, *solve.args, **solve.keywords)
+        outcome = by_kernel(lambda gpu: by_gpu(run=gpu), self.capacity, device)
+        return solve(traced=traced) if outcome is None else outcome
 
     def solve_with_tangents(
         self,
@@ -344,10 +350,17 @@ class Ensemble(eqx.Module):
         **Returns:** the outcome; for each tangent the derivative in every cell, 0 if there is no event or the event is
         at the start; and a mask of the cells whose derivative is NaN because an earlier event was grazing.
         """
+        device = "cpu" if traced else settings.device
         if self.problem is not None:
-            arguments = (tuple(tangent.problem for tangent in tangents), jnp.asarray(t1), jnp.asarray(cells), settings)
-            options = {"nonterminal": self.continues, "one_kernel": one_kernel, "traced": traced}
-            return *solve_ensemble_with_tangents(self.problem, *arguments, **options), False
+            options = {"nonterminal": self.continues}
+            along = tuple(tangent.problem for tangent in tangents)
+            arguments = (self.problem, along, jnp.asarray(t1), jnp.asarray(cells), settings)
+            solved = by_kernel(
+                lambda gpu: solve_smooth_with_tangents(*arguments, **options, run=gpu), self.capacity, device
+            )
+            if solved is None:
+                solved = solve_ensemble_with_tangents(*arguments, **options, one_kernel=one_kernel, traced=traced)
+            return solved[0], solved[1], False
         outcome, xp = None, jnp if traced else np
         if self.continues:
             # The derivatives need the run only up to the event, whose time is known.
@@ -356,8 +369,17 @@ class Ensemble(eqx.Module):
         modes, first, states = self.start
         pairs = tuple((tangent.start[0], tangent.start[2]) for tangent in tangents)
         options = {"counters": self.counters, "ends_on_event": not self.continues, "traced": traced}
-        run, sensitivities = solve_hybrid_with_tangents(modes, pairs, first, states, t1, cells, settings, **options)
+        solve = functools.partial(
+            solve_hybrid_with_tangents, modes, pairs, first, states, t1, cells, settings, **options
+        )
+        solved = by_kernel(lambda gpu: solve(solve=functools.partial(solve_in_modes, run=gpu)), self.capacity, device)
+        run, sensitivities = solve() if solved is None else solved
         return run if outcome is None else outcome, sensitivities.slopes, sensitivities.grazing
+
+    @property
+    def capacity(self) -> int:
+        """Number of cells, padding included."""
+        return (self.problem.start()[0] if self.problem is not None else self.start[2]).shape[-1]
 
     @property
     def starts(self) -> Float[Array, "components cells"]:

@@ -332,10 +332,13 @@ def check_horizon(t1: ArrayLike, tolerance: ArrayLike) -> None:
 
 
 def settings_for_lanes(
-    tolerance: Float[ArrayLike, ""], solver: diffrax.AbstractSolver | None, max_steps: int = DEFAULT_MAX_STEPS
+    tolerance: Float[ArrayLike, ""],
+    solver: diffrax.AbstractSolver | None,
+    max_steps: int = DEFAULT_MAX_STEPS,
+    device: str | None = None,
 ) -> Settings:
     """The settings of runs in lanes; raises `ValueError` unless the solver is an explicit Runge-Kutta method."""
-    settings = Settings(tolerance, solver, max_steps=max_steps)
+    settings = Settings(tolerance, solver, max_steps=max_steps, device=device)
     explicit_tableau(settings.for_lanes)
     return settings
 

@@ -20,6 +20,7 @@ from .. import sweeps
 from ..compilation.xla_cpu import programs_in
 from ..integration import Settings
 from ..integration.problem import DEFAULT_MAX_STEPS, Status, require_times
+from ..kernels import CELLS_OF_KERNEL, gpu_for, place_of_jax, require_device
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
 from ..sweeps.grid import EQUATIONS, FOR_A_TIME, REMARK, SHOWN_IN, columns
 from ..sweeps.table import cells_with
@@ -101,12 +102,14 @@ class Options(NamedTuple):
     path: str | Path | None = None
     progress: bool = True
     executor: Executor | None = None
+    device: str | None = None
 
     @property
     def settings(self) -> Settings:
         """The settings of the integration, checked."""
         require_whole(self.max_steps, "max_steps", 1)
-        return settings_for_lanes(self.tolerance, self.solver, int(self.max_steps))
+        require_device(self.device)
+        return settings_for_lanes(self.tolerance, self.solver, int(self.max_steps), self.device)
 
 
 @explaining
@@ -129,6 +132,7 @@ def sweep(
     path: str | Path | None = None,
     progress: bool = True,
     executor: Executor | None = None,
+    device: str | None = None,
     input: object = None,
     jumps: object = None,
 ) -> Table:
@@ -156,6 +160,7 @@ def sweep(
     - `progress`: whether to show progress, on a terminal or in a notebook.
     - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes`; by default a thread
       for each core. For other processes, define classes and functions at the top level of a module.
+    - `device`: "cpu" or "gpu"; by default, large tables run on a GPU if there is one ([Performance](/performance.md#gpus)).
 
     **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" if the
     run reached `t1`, "stopped" if a mode without a reset ended, "failed", "unresolved" (for example after 2000 resets
@@ -193,7 +198,7 @@ def sweep(
     model = model_of(system, start, event, input, jumps)
     check_horizon(t1, tolerance)
     samples = samples_of(model.quantities, times, quantities, t1)
-    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor, device)
     timed = samples is None or event is not None
     for name, option in {"errors": errors, "sensitivities": list(sensitivities)}.items() if not timed else ():
         if option:
@@ -306,6 +311,8 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
     cells, is_scene = size_of(grid), isinstance(job.model, AbstractSceneModel)
     chunk = None if is_scene or cells <= 4 * LEAST_CHUNK else max(LEAST_CHUNK, chunk_for(cells))
+    if job.samples is None and gpu_for(cells, options.device) is not None:
+        chunk = min(CELLS_OF_KERNEL, 1 << (cells - 1).bit_length())
     inner, most = [], None
     if job.samples is not None:
         request |= {"quantities": list(job.samples.names)}
@@ -313,7 +320,8 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
         # A run has about a dozen components.
         most = max(16, 1 << (MOST_SAMPLED // (12 * len(job.samples.times))).bit_length() - 1)
     running = {"path": options.path, "progress": options.progress, "executor": options.executor}
-    table = sweeps.sweep(job, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
+    with place_of_jax(cells, options.device, job.samples is None):
+        table = sweeps.sweep(job, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
     illegal = cells_with(table, "status", Status.ILLEGAL.word)
     if len(illegal):
         values = {name: float(value[0]) for name, value in columns(grid, int(illegal[0]), 1).items()}

@@ -13,6 +13,7 @@ from ..derivatives import tangent_scale, tangents_by
 from ..hybrid import HybridOutcome
 from ..integration import Outcome, Settings, solve_by_diffrax
 from ..integration.problem import TIGHTEST, TIGHTEST_IN_SINGLE, Status
+from ..kernels import place_of_jax
 from ..sweeps import Axis, Variable
 from ..validation import as_number
 from .event import SILENT, Ensemble, counted, status_of
@@ -139,6 +140,12 @@ class TableJob(NamedTuple):
             numbers, names = ([getattr(axis, key) for axis in self.listed] for key in ("number", "name"))
             job = self._replace(listed=())
             return job(dict(zip(numbers, values, strict=True)), count) | dict(zip(names, values, strict=True))
+        size = next((len(values) for values in columns.values()), 1)
+        with place_of_jax(size, self.settings.device, self.samples is None):
+            return self._of_cells(columns, count)
+
+    def _of_cells(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells of a grid, of which only the first `count` are run."""
         if self.by_diffrax and count == 0:
             # Diffrax always computes a whole chunk, so a call only to compile would compute the first chunk twice.
             return {}

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..compilation.cache import forget_programs_if_many, memory_of_machine
+from ..compilation.xla_cpu import current_platform
 from ..terminal import Progress
 from ..text import shown
 from ..validation import require_flag, require_whole, warn
@@ -365,7 +366,7 @@ def chunk_for(cells: int) -> int:
     >>> chunk_for(100_000) >= chunk_for(4)
     True
     """
-    if jax.default_backend() != "cpu":
+    if current_platform() != "cpu":
         return 65536 if cells > 4096 else 4096
     # For two cells, an ensemble of 64 lanes takes no longer than one of two lanes: most of the time is spent starting
     # loops.
@@ -380,7 +381,7 @@ def chunks_together(layout: Layout) -> int:
 
 def workers() -> int:
     """Number of chunks that run at once in this process: one for each core; an accelerator takes one at a time."""
-    if jax.default_backend() != "cpu":
+    if current_platform() != "cpu":
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

@@ -389,6 +389,7 @@ def sweep(
     path: str | Path | None = None,
     progress: bool = True,
     executor: Executor | None = None,
+    device: str | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
     jumps: Sequence[Any] | Array | None = None,
 ) -> Table:
@@ -409,6 +410,7 @@ def sweep(
     - `progress`: whether to show progress, on a terminal or in a notebook.
     - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a Dask client;
       by default, a thread for each core. On the same kind of processor, all executors give bitwise equal results.
+    - `device`: "cpu" or "gpu"; by default, large tables run on a GPU if there is one.
     - `max_steps`: a ride that needs more steps, including rejected ones, fails; at least 1.
     - `jumps`: times [s] at which the input jumps, as for `simulate`.
 
@@ -439,7 +441,7 @@ def sweep(
     model = checked_model(scene, launch, t1, input, tolerance, jumps)
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {shown(axes)} must be a dictionary, full name of a parameter -> values")
-    options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor)
+    options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor, device=device)
     return table_of(model, full_axes(axes, model.known), t1, options, form=FORM)
 
 

@@ -258,6 +258,7 @@ def inversion_table(
     sensitivities: Sequence[str] = (),
     progress: bool = True,
     executor: Executor | None = None,
+    device: str | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
 ) -> Table:
     """Inversion times over a grid of launches and scenes, in one batched call on all cores.
@@ -295,6 +296,7 @@ def inversion_table(
       everywhere.
     - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a Dask client;
       by default, a thread for each core. On the same kind of processor, all executors give bitwise equal results.
+    - `device`: "cpu" or "gpu"; by default, large tables run on a GPU if there is one.
     - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1. In a hybrid run, the limit
       applies to each time in a mode; `method="diffrax"` allows 100 000 steps at most.
 
@@ -353,7 +355,7 @@ def inversion_table(
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {shown(crossing)} must be 'first' for method = 'diffrax'")
     launch_values = {"launch": launch, "theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
-    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor, device)
     return event_table(scene, launch_values, axes, t1, event_of(scene, angle), options, crossing, method)
 
 
@@ -376,6 +378,7 @@ def reversal_table(
     sensitivities: Sequence[str] = (),
     progress: bool = True,
     executor: Executor | None = None,
+    device: str | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
 ) -> Table:
     """Times of the first reversal of spin over a grid of launches and scenes, in one batched call on all cores.
@@ -404,7 +407,7 @@ def reversal_table(
     """
     require_outside((scene, launch, theta, spin, azimuth, mu, axes, t1), "reversal_table", "reversal_time")
     launch_values = {"launch": launch, "theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
-    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor)
+    options = Options(tolerance, solver, max_steps, scattered, errors, sensitivities, path, progress, executor, device)
     return event_table(scene, launch_values, axes, t1, None, options)
 
 

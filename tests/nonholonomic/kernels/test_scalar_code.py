@@ -1,5 +1,6 @@
 """Functions written in JavaScript have the same values in a real browser."""
 
+import ctypes
 import json
 
 import jax
@@ -7,8 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import needs_browser, open_browser
+from host_kernels import compiled, needs_compiler
 
-from nonholonomic.views.explore import javascript
+from nonholonomic.kernels import javascript
+from nonholonomic.kernels.device_code import LOOPS
+from nonholonomic.kernels.scalar_code import CUDA, scalar_code
 
 X = np.array([0.3, -1.2, 2.5])
 
@@ -72,6 +76,8 @@ def array_work(x):
         x[indices],
         x[indices + jnp.arange(2)],
         x.at[indices].set(7.0),
+        x.at[jnp.array([0, 2, 0])].add(2.0 * x),
+        x.at[indices + jnp.array([0, 1, 2])].add(2.0 * x),
         jax.lax.dynamic_slice(x, (indices,), (2,)),
     )
     outputs = (matrix @ x, matrix.T.ravel(), x @ x, jnp.prod(x), jnp.max(x), jnp.min(x), jnp.argmin(x), jnp.argmax(x))
@@ -118,6 +124,33 @@ def test_the_browser_computes_what_jax_computes(browser, function):
     numbers = browser.execute_script(f"return ({text})({json.dumps(X.tolist())}, []).map(Number)")
     expected = np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(function(jnp.asarray(X)))])
     np.testing.assert_allclose(np.array(numbers, float), expected, rtol=1e-14, atol=1e-15)
+
+
+@needs_compiler
+@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda function: function.__name__)
+def test_the_host_computes_what_jax_computes(function):
+    expected = np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(function(jnp.asarray(X)))])
+    np.testing.assert_allclose(on_host(function, X, expected.size), expected, rtol=1e-14, atol=1e-15)
+
+
+def on_host(function, numbers, results):
+    """The results of a function of a list of numbers, written in CUDA C and compiled for the host."""
+    entry = 'extern "C" void called(const double* numbers, double* results) { written(numbers, results); }'
+    library = compiled(
+        "\n".join([LOOPS.read_text(), scalar_code(CUDA, "written", function, jnp.asarray(numbers)), entry])
+    )
+    out = np.zeros(results)
+    library.called(*(ctypes.c_void_p(array.ctypes.data) for array in (numbers, out)))
+    return out
+
+
+@needs_compiler
+def test_no_number_is_lost_on_the_host_that_is_not_finite():
+    def function(x):
+        return x / 0.0, 0.0 * x / 0.0, jnp.inf * x, jnp.where(x > 1.0, x, -jnp.inf), jnp.maximum(x / 0.0, 0.0 * x / 0.0)
+
+    results = on_host(function, np.array(-2.0), 5)
+    np.testing.assert_array_equal(results, [-np.inf, np.nan, -np.inf, -np.inf, np.nan])
 
 
 @needs_browser

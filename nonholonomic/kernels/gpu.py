@@ -1,0 +1,216 @@
+"""The GPU: compile kernels for it, and run cells on it. NVIDIA's packages are the extra `gpu`.
+
+Numbers go to the GPU and back as NumPy arrays: those of a run are few beside its steps. JAX need not know the GPU.
+"""
+
+import ctypes
+import functools
+import importlib.util
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..compilation.cache import enable_compilation_cache, kept_files
+from ..compilation.xla_cpu import current_platform, on_cpu
+from ..text import shown
+from ..validation import warn
+from .device_code import Kernel
+
+#: Number of threads in a block, and greatest number of blocks for each processor, of which four run at once.
+BLOCK, BLOCKS = 64, 8
+
+#: With fewer cells than this, a CPU is faster: a kernel lasts as long as the longest run, about 20 ms for a table on the plane.
+LEAST_CELLS = 4096
+
+#: Number of cells in a chunk of a table.
+CELLS_OF_KERNEL = 1 << 17
+
+#: Number of cells of the first launch of a kernel, and how long a launch may take [s]: a GPU that draws a screen stops longer
+#: ones, and Ctrl-C waits for the end of a launch.
+FIRST_LAUNCH, LONGEST = 16384, 0.5
+
+OPTIONS = ("--std=c++17", "-diag-suppress=177,550")
+
+
+class KernelError(RuntimeError):
+    """A kernel could not be compiled or run; the message says why."""
+
+
+def compiled(text: str, architecture: str) -> bytes:
+    """The machine code of a program; this needs no GPU.
+
+    **Arguments:** `text`: in CUDA C; `architecture`: such as "sm_90".
+
+    **Raises:** `KernelError` with what the compiler says.
+    """
+    from cuda.bindings import nvrtc  # pyright: ignore[reportMissingImports]
+
+    program = _checked(nvrtc.nvrtcCreateProgram(text.encode(), b"kernel.cu", 0, [], []))
+    options = [option.encode() for option in (f"--gpu-architecture={architecture}", *OPTIONS)]
+    (result,) = nvrtc.nvrtcCompileProgram(program, len(options), options)
+    if result != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+        log = b" " * _checked(nvrtc.nvrtcGetProgramLogSize(program))
+        nvrtc.nvrtcGetProgramLog(program, log)
+        raise KernelError(f"the kernel does not compile: {log.decode(errors='replace').strip()[:300]}")
+    code = b" " * _checked(nvrtc.nvrtcGetCUBINSize(program))
+    _checked(nvrtc.nvrtcGetCUBIN(program, code))
+    nvrtc.nvrtcDestroyProgram(program)
+    return code
+
+
+def _checked(results: tuple[Any, ...]) -> Any:
+    """The result of a call of NVIDIA's libraries. **Raises:** `KernelError` unless the call succeeded."""
+    status, *values = results
+    if int(status):
+        raise KernelError(f"the GPU reports {status.name}")
+    return values[0] if len(values) == 1 else tuple(values)
+
+
+class Gpu:
+    """The first GPU of this machine. Calling it runs cells, as a `Runner` does."""
+
+    def __init__(self, driver: Any):
+        self.driver, self.lock = driver, threading.Lock()
+        _checked(driver.cuInit(0))
+        self.device = _checked(driver.cuDeviceGet(0))
+        # JAX uses this context, too.
+        self.context = _checked(driver.cuDevicePrimaryCtxRetain(self.device))
+        kinds = driver.CUdevice_attribute
+        major, minor, self.processors = (
+            _checked(driver.cuDeviceGetAttribute(kind, self.device))
+            for kind in (
+                kinds.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR,
+                kinds.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR,
+                kinds.CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT,
+            )
+        )
+        self.architecture = f"sm_{major}{minor}"
+        # By the text of a kernel: its function, and the number of cells of its next launch.
+        self.functions: dict[str, Any] = {}
+        self.sizes: dict[str, int] = {}
+
+    def __call__(
+        self,
+        kernel: Kernel,
+        shared: Float[np.ndarray, " shared"],
+        columns: Float[np.ndarray, "numbers cells"],
+        count: int,
+    ) -> Float[np.ndarray, "results cells"]:
+        driver, capacity = self.driver, columns.shape[1]
+        with self.lock:
+            _checked(driver.cuCtxSetCurrent(self.context))
+            function = self.function(kernel.text)
+            results = np.zeros((kernel.results, capacity))
+            with self.copied(shared, columns, results, np.zeros(1, np.uint64)) as (*pointers, queue):
+                end = 0
+                while end < count:
+                    size, start = self.sizes.get(kernel.text, FIRST_LAUNCH), time.perf_counter()
+                    begin, end = end, min(end + size, count)
+                    first = np.array([begin], np.uint64)
+                    _checked(driver.cuMemcpyHtoD(queue, first.ctypes.data, first.nbytes))
+                    arguments = ((*map(int, pointers), capacity, end, int(queue)), (*[ctypes.c_void_p] * 3, *_COUNTS))
+                    blocks = min(-(-(end - begin) // BLOCK), BLOCKS * self.processors)
+                    _checked(driver.cuLaunchKernel(function, blocks, 1, 1, BLOCK, 1, 1, 0, 0, arguments, 0))
+                    _checked(driver.cuCtxSynchronize())
+                    share = 0.5 * LONGEST / (time.perf_counter() - start)
+                    self.sizes[kernel.text] = max(int((end - begin) * min(8.0, share)), BLOCK)
+                _checked(driver.cuMemcpyDtoH(results.ctypes.data, pointers[2], results.nbytes))
+        return results
+
+    def function(self, text: str) -> Any:
+        """The function that runs cells, compiled once, and kept in the cache of compiled programs."""
+        if text not in self.functions:
+            facts = ("kernel", self.architecture, OPTIONS, text)
+            files = kept_files(enable_compilation_cache(), facts, lambda: {"code": compiled(text, self.architecture)})
+            module = _checked(self.driver.cuModuleLoadData(np.frombuffer(files["code"], np.uint8).ctypes.data))
+            self.functions[text] = _checked(self.driver.cuModuleGetFunction(module, b"run_cells"))
+        return self.functions[text]
+
+    @contextmanager
+    def copied(self, *arrays: np.ndarray) -> Iterator[list[Any]]:
+        """Copies of arrays in the memory of the GPU."""
+        pointers: list[Any] = []
+        try:
+            for array in map(np.ascontiguousarray, arrays):
+                pointers.append(_checked(self.driver.cuMemAlloc(max(array.nbytes, 8))))
+                if array.nbytes:
+                    _checked(self.driver.cuMemcpyHtoD(pointers[-1], array.ctypes.data, array.nbytes))
+            yield pointers
+        finally:
+            for pointer in pointers:
+                self.driver.cuMemFree(pointer)
+
+
+#: The types of the last arguments of a kernel: capacity, end, and the queue.
+_COUNTS = (ctypes.c_longlong, ctypes.c_ulonglong, ctypes.c_void_p)
+
+
+@functools.lru_cache(maxsize=1)
+def first_gpu() -> Gpu | None:
+    """The GPU of this machine, or `None` if there is none, JAX_PLATFORMS leaves it out, or the extra is missing."""
+    chosen = os.environ.get("JAX_PLATFORMS", "")
+    if chosen and not {"cuda", "gpu"} & set(chosen.split(",")):
+        return None
+    is_default = current_platform() == "gpu"
+    if importlib.util.find_spec("cuda") is None or importlib.util.find_spec("cuda.bindings") is None:
+        if is_default:
+            warn(
+                "large tables take a GPU some fifty times as long without its kernels: pip install 'nonholonomic[gpu]'"
+            )
+        return None
+    from cuda.bindings import driver  # pyright: ignore[reportMissingImports]
+
+    try:
+        return Gpu(driver)
+    except Exception as error:  # without a driver, NVIDIA's package raises an error of its own
+        if is_default:
+            warn(f"tables run by JAX's loops, because the GPU cannot be used for kernels: {error}")
+        return None
+
+
+def require_device(device: object) -> None:
+    """Raise `ValueError` unless a table can run on this device."""
+    if device not in (None, "cpu", "gpu"):
+        raise ValueError(
+            f"device = {shown(device)} must be 'cpu', 'gpu' or None, for a GPU if there is one and the table is large"
+        )
+    if device == "gpu" and first_gpu() is None:
+        why = (
+            "none is found for kernels: this takes a GPU of NVIDIA with its driver, and pip install 'nonholonomic[gpu]'"
+        )
+        raise ValueError(f"device = 'gpu': {why}; leave device out to run on the CPU")
+
+
+def gpu_for(cells: int, device: str | None) -> Gpu | None:
+    """The GPU that runs so many cells, `None` for the CPU. **Arguments:** `device`: "cpu", "gpu", or `None` for the faster."""
+    return first_gpu() if device == "gpu" or (device is None and cells >= LEAST_CELLS) else None
+
+
+def place_of_jax(cells: int, device: str | None, has_kernel: bool = True) -> AbstractContextManager[None]:
+    """A context for JAX's part of a table: on the CPU if the table is small or a kernel runs it; otherwise, JAX's default.
+
+    **Arguments:** `has_kernel`: whether a kernel can run the cells; the others as for `gpu_for`.
+    """
+    is_on_cpu = device == "cpu" or cells < LEAST_CELLS or (has_kernel and gpu_for(cells, device) is not None)
+    return on_cpu() if is_on_cpu else nullcontext()
+
+
+def by_kernel(solve: Callable[[Gpu], Any], cells: int, device: str | None) -> Any:
+    """The result of a solve by a kernel; `None` if it shall not run by one, or the kernel fails, which a warning then says.
+
+    **Arguments:** `solve`: function of the GPU; `cells`, `device`: as for `gpu_for`.
+    """
+    gpu = gpu_for(cells, device)
+    if gpu is None:
+        return None
+    try:
+        return solve(gpu)
+    except (KernelError, ValueError) as error:
+        warn(f"this table runs by JAX's loops and not by a kernel on the GPU: {error}")
+        return None

@@ -1,0 +1,149 @@
+// The loops of a run in one thread: over steps and stages, over rounds, and over the stretches of a transition. Everything else
+// is generated from Python (`device.py`) and follows this text: the equations, the coefficients of the Runge-Kutta pair, the
+// first step, step-size control, the location of events, and what happens between the modes. The loops are those of
+// `integrator.js`. The same text compiles for the host, where it is a function that runs one cell after another.
+
+#ifdef __CUDACC_RTC__
+// What a step calls is written out, unless it is large; what happens between steps is called, if it is.
+#ifdef LARGE
+#define DEVICE __device__
+#define UNROLLED _Pragma("unroll 1")
+#else
+#define DEVICE __device__ __forceinline__
+#define UNROLLED _Pragma("unroll")
+#endif
+#define CALLED __device__ __noinline__
+#define KERNEL extern "C" __global__ void __launch_bounds__(64)
+#define NaN __longlong_as_double(0x7ff8000000000000LL)
+#define Infinity __longlong_as_double(0x7ff0000000000000LL)
+#define NEXT atomicAdd(queue, 1ULL)
+#else
+#include <cmath>
+#include <limits>
+using namespace std;
+#define DEVICE inline
+#define CALLED inline
+#define KERNEL extern "C" void
+#define NaN std::numeric_limits<double>::quiet_NaN()
+#define Infinity std::numeric_limits<double>::infinity()
+#define NEXT (*queue)++
+#define UNROLLED
+inline double rsqrt(double x) { return 1.0 / sqrt(x); }
+#endif
+
+DEVICE static double greatest(double a, double b) { return a > b || a != a ? a : b; }
+DEVICE static double least(double a, double b) { return a < b || a != a ? a : b; }
+DEVICE static double sign(double x) { return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : x; }
+DEVICE static bool is_finite(double x) { return fabs(x) < Infinity; }
+DEVICE static double logistic(double x) { return 1.0 / (1.0 + exp(-x)); }
+
+// The margins, and the least of them and of the event function.
+template <class M>
+DEVICE double least_margin(const double* constants, const double* time, const double* state, const double* rate, double side,
+                           double* margins) {
+  M::margins(constants, time, state, margins);
+  double result = Infinity;
+  UNROLLED for (int k = 0; k < M::margins_count; k++) result = least(result, margins[k]);
+  if constexpr (M::has_event) {
+    double value;
+    M::crossing(constants, state, rate, &value);
+    result = least(result, side * value);
+  }
+  return result;
+}
+
+// The stages of a step from one on: their rates, the margins at the checked ones, and the first of these at which one was negative.
+template <class M, int stage>
+DEVICE void take_stages(const double* constants, double from, const double* state, double side, double length,
+                        double (*rates)[M::components], double* watched, double& negative) {
+  if constexpr (stage < M::stages) {
+    double there[M::components], time = from + M::template place<stage>() * length;
+    UNROLLED for (int k = 0; k < M::components; k++) there[k] = state[k] + length * M::template sum<stage>(rates, k);
+    M::field(constants, &time, there, rates[stage + 1]);
+    if constexpr (constexpr int row = M::template look<stage>(); row > 0) {
+      double* const margins = watched + row * M::margins_count;
+      if (least_margin<M>(constants, &time, there, rates[stage + 1], side, margins) < 0.0)
+        negative = least(negative, M::template place<stage>());
+    }
+    take_stages<M, stage + 1>(constants, from, state, side, length, rates, watched, negative);
+  }
+}
+
+// One step from a state with a known rate, like `Step` in Python: state, rate, error, the least of margins and event function at
+// the end, the first place at which one of them was negative, the margins at the start, at the checked stages and at the end,
+// and the state in the middle.
+template <class M>
+DEVICE void try_step(const double* constants, double from, const double* state, const double* rate, const double* margins,
+                     double side, double length, double* tried) {
+  constexpr int n = M::components, m = M::margins_count, stages = M::stages, rows = M::looks + 2;
+  double rates[stages + 2][n], time = from + length, negative = 2.0;
+  double *const end = tried, *const last = tried + n, *const error = tried + 2 * n, *const watched = tried + 3 * n + 2;
+  double* const middle = watched + rows * m;
+  UNROLLED for (int k = 0; k < m; k++) watched[k] = margins[k];
+  UNROLLED for (int k = 0; k < n; k++) rates[0][k] = rate[k];
+  take_stages<M, 0>(constants, from, state, side, length, rates, watched, negative);
+  UNROLLED for (int k = 0; k < n; k++) end[k] = state[k] + length * M::template sum<stages>(rates, k);
+  M::field(constants, &time, end, last);
+  UNROLLED for (int k = 0; k < n; k++) {
+    rates[stages + 1][k] = last[k];
+    error[k] = length * M::template sum<stages + 1>(rates, k);
+    middle[k] = state[k] + length * M::template sum<stages + 2>(rates, k);
+  }
+  const double margin = least_margin<M>(constants, &time, end, last, side, watched + (rows - 1) * m);
+  tried[3 * n] = margin == Infinity ? 1.0 : margin;
+  tried[3 * n + 1] = negative;
+}
+
+// Run one smooth motion, whose constants and lane are given, to its end.
+template <class M>
+DEVICE void run_motion(double* start) {
+  constexpr int n = M::components, m = M::margins_count;
+  // Copies, which stay in registers: called functions have written and will read the originals.
+  double constants[M::constants], lane[M::lane_size];
+  UNROLLED for (int k = 0; k < M::constants; k++) constants[k] = start[k];
+  UNROLLED for (int k = 0; k < M::lane_size; k++) lane[k] = start[M::constants + k];
+  while (lane[M::lane_status] == M::running) {
+    double length, tried[4 * n + 2 + (M::looks + 2) * m];
+    M::length(constants, lane, &length);
+    try_step<M>(constants, lane[M::lane_time], lane + M::lane_state, lane + M::lane_rate, lane + M::lane_margins,
+                lane[M::lane_side], length, tried);
+    M::after(constants, lane, &length, tried, lane);
+  }
+  UNROLLED for (int k = 0; k < M::lane_size; k++) start[M::constants + k] = lane[k];
+}
+
+// Run a smooth problem from its start to its end.
+template <class M>
+DEVICE void run_smooth(const double* values, double* outcome) {
+  double start[M::constants + M::lane_size];
+  M::begin(values, start);
+  run_motion<M>(start);
+  M::ended(start, start + M::constants, values, outcome);
+}
+
+// One round: a mode to its end, and the transition, which is instantaneous or goes through flights that end with impacts.
+template <class M>
+DEVICE void one_round(const double* values, double* runs) {
+  double start[M::constants + M::lane_size];
+  M::begin(values, runs, start);
+  run_motion<M>(start);
+  M::ended(start, start + M::constants, values, runs, runs);
+  if (runs[M::runs_status] != M::left) return;
+  if constexpr (M::most_hops == 0) {
+    M::reset(values, runs, runs);
+  } else {
+    // Whether the stretch is open, the time since the end of the mode, and the stretch.
+    double current[2 + M::stretch];
+    M::lost(values, runs, current);
+    for (int hops = 0; current[0] != 0.0 && hops < M::most_hops; hops++) M::hop(values, runs, current + 2, current);
+    M::closed(values, runs, current + 2, runs);
+  }
+}
+
+// Each round integrates one mode to its end, and its transition leads to the next mode.
+template <class R>
+DEVICE void run_rounds(const double* values, double* runs) {
+  R::first(values, runs);
+  for (int round = 0; round < R::rounds && runs[R::runs_status] == R::running; round++) R::advance(values, runs);
+  if (runs[R::runs_status] == R::running) runs[R::runs_status] = R::unresolved;
+}
