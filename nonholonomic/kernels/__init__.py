@@ -8,6 +8,7 @@ each a `Part` of a program that the loops of a language call. `solve_smooth`, `s
 from .device_code import Kernel as Kernel
 from .device_code import solve_in_modes as solve_in_modes
 from .device_code import solve_smooth as solve_smooth
+from .device_code import solve_smooth_with_samples as solve_smooth_with_samples
 from .device_code import solve_smooth_with_tangents as solve_smooth_with_tangents
 from .gpu import CELLS_OF_KERNEL as CELLS_OF_KERNEL
 from .gpu import by_kernel as by_kernel

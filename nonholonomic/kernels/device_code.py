@@ -94,7 +94,37 @@ def solve_smooth(
     """`solve_ensemble` by a kernel. **Arguments:** as there, and `run`: runs a kernel."""
     cells = problem.start()[0].shape[1]
     arguments = (problem, jnp.asarray(t1), settings)
-    return _solved(arguments, cells, int(count), run, {"passes": nonterminal, "n_blocks": n_blocks})
+    return _solved(arguments, cells, int(count), run, {"passes": nonterminal, "n_blocks": n_blocks})[0]
+
+
+def solve_smooth_with_samples(
+    problem: AbstractProblem,
+    times: Float[np.ndarray, " times"],
+    t1: Float[Array, "..."],
+    count: Int[Array, ""] | int,
+    settings: Settings,
+    *,
+    run: Runner,
+    read: Callable[[Float[Array, "components 1"]], PyTree],
+) -> tuple[Outcome[np.ndarray], PyTree]:
+    """`solve_with_samples` by a kernel, in which a shorter step from the same start leads to each sample.
+
+    **Arguments:** as there, and `run`: runs a kernel; `read`: an `equinox.Module`, a function of the state of one run whose
+    numbers have the cells in their last axis.
+    """
+    cells, arguments = problem.start()[0].shape[1], (problem, jnp.asarray(t1), settings, read)
+    options = {"passes": False, "n_blocks": 1, "times": len(times)}
+    outcome, rows = _solved(arguments, cells, int(count), run, options, times)
+    recipe = Recipe.of(arguments, options)
+    state = jax.ShapeDtypeStruct((len(problem.start()[0]), 1), jnp.result_type(float))
+    kinds = eqx.filter_eval_shape(lambda values, state: recipe.arguments(values)[3](state), recipe.values, state)
+    leaves, structure = jax.tree.flatten(kinds)
+    parts = np.split(rows.reshape(len(times), -1, cells), np.cumsum(list(map(size_of, leaves)))[:-1], axis=1)
+    samples = [
+        np.moveaxis(part, -1, 0).reshape(cells, len(times), *leaf.shape)
+        for part, leaf in zip(parts, leaves, strict=True)
+    ]
+    return outcome, jax.tree.unflatten(structure, samples)
 
 
 def solve_smooth_with_tangents(
@@ -145,21 +175,28 @@ def solve_in_modes(
     horizon = np.broadcast_to(np.asarray(t1, float), len(mode))
     arguments: PyTree = (modes, np.asarray(mode), np.asarray(state), horizon, settings)
     options = {"counters": counters, "passes": nonterminal, "n_blocks": n_blocks}
-    return _solved(arguments, len(mode), int(count), run, options)
+    return _solved(arguments, len(mode), int(count), run, options)[0]
 
 
-def _solved(arguments: PyTree, cells: int, count: int, run: Runner, options: dict[str, Any]) -> Any:
-    """The outcome of some cells; that of padding is zero."""
+def _solved(
+    arguments: PyTree,
+    cells: int,
+    count: int,
+    run: Runner,
+    options: dict[str, Any],
+    times: Float[np.ndarray, " times"] = np.zeros(0),  # noqa: B008  Nothing changes it.
+) -> Any:
+    """The outcome of some cells, zero for padding, and the rows of their samples at some times."""
     kernel, outcome = kernel_of(Recipe.of(arguments, options))
     shared, columns = [np.zeros(0)], [np.zeros((0, cells))]
     for leaf in map(np.asarray, jax.tree.leaves(eqx.filter(arguments, is_array))):
         (columns if leaf.ndim else shared).append(leaf.reshape(-1, *leaf.shape[-1:]).astype(float))
-    results = run(kernel, np.concatenate(shared), np.concatenate(columns), count)
-    parts = np.split(results, np.cumsum([size_of(part) for part in outcome])[:-1])
+    results = run(kernel, np.concatenate([*shared, times]), np.concatenate(columns), count)
+    *parts, samples = np.split(results, np.cumsum([size_of(part) for part in outcome]))
     # The parts of an outcome are numbers, or lists of numbers.
     return outcome._make(
         values.reshape(*part.shape[:-1], cells).astype(part.dtype) for values, part in zip(parts, outcome, strict=True)
-    )
+    ), samples
 
 
 @functools.lru_cache(maxsize=64)
@@ -181,13 +218,23 @@ def kernel_of(recipe: Recipe) -> tuple[Kernel, Outcome | HybridOutcome]:
         structs.append(_struct_of("Rounds", facts, [_function("first", rounds), "\n".join(advance)]))
         run, parts = "run_rounds<Rounds>(values, outcome);", kinds
     else:
-        part = SmoothRuns(recipe.arguments, **options).part(values)
+        times = options.get("times", 0)
+        read = (lambda values, state: recipe.arguments(values)[3](state)) if times else None
+        start = lambda values: recipe.arguments(values)[:3]  # noqa: E731
+        part = SmoothRuns(start, options["passes"], options["n_blocks"], read).part(values)
         outcome = eqx.filter_eval_shape(part.functions["ended"][0], *part.functions["ended"][1])
-        structs, run, parts = [_struct("Motion", part, {})], "run_smooth<Motion>(values, outcome);", [part]
+        structs, parts = [_struct("Motion", part, {})], [part]
+        run, results = "run_smooth<Motion>(values, outcome);", size_of(outcome)
+        if times:
+            shared = sum(leaf.shape == () for leaf in jax.tree.leaves(values))
+            samples = f"{{shared + {shared}, {times}, 0, results + {results} * capacity + cell, capacity}}"
+            run = f"run_sampled<Motion>(values, outcome, {samples});"
+    results = size_of(outcome)
     lines = max(len(part.facts["stages"]) * _function("field", part).count("\n") for part in parts)
     large = "#define LARGE\n" if lines > MOST_WRITTEN_OUT else ""
-    results = size_of(outcome)
-    return Kernel("\n".join([large + LOOPS.read_text(), *structs, _entry(values, results, run)]), results), outcome
+    text = "\n".join([large + LOOPS.read_text(), *structs, _entry(values, results, run)])
+    samples = options.get("times", 0) * parts[0].facts.get("quantities", 0)
+    return Kernel(text, results + samples), outcome
 
 
 def _function(name: str, part: Part) -> str:
@@ -213,7 +260,7 @@ def _struct(name: str, part: Part, more: dict[str, int]) -> str:
         f"lane_{name}": facts["lane"][name] for name in ("status", "time", "state", "rate", "margins", "side", "size")
     }
     numbers |= {"stages": stages, "looks": len(facts["looks"]), "has_event": crossing is not None}
-    numbers |= {"most_hops": facts.get("most_hops", 0), "stretch": facts.get("stretch", 0)} | more
+    numbers |= {name: facts.get(name, 0) for name in ("most_hops", "stretch", "quantities")} | more
     # After the stages come the end of the step, its error and its middle.
     sums = [*facts["stages"], facts["step"], facts["error"], facts["middle"]]
     looks = [facts["looks"].index(k) + 1 if k in facts["looks"] else 0 for k in range(stages)]

@@ -53,19 +53,19 @@ DEVICE double least_margin(const double* constants, const double* time, const do
 }
 
 // The stages of a step from one on: their rates, the margins at the checked ones, and the first of these at which one was negative.
-template <class M, int stage>
+template <class M, int stage, bool watches>
 DEVICE void take_stages(const double* constants, double from, const double* state, double side, double length,
                         double (*rates)[M::components], double* watched, double& negative) {
   if constexpr (stage < M::stages) {
     double there[M::components], time = from + M::template place<stage>() * length;
     UNROLLED for (int k = 0; k < M::components; k++) there[k] = state[k] + length * M::template sum<stage>(rates, k);
     M::field(constants, &time, there, rates[stage + 1]);
-    if constexpr (constexpr int row = M::template look<stage>(); row > 0) {
+    if constexpr (constexpr int row = M::template look<stage>(); watches && row > 0) {
       double* const margins = watched + row * M::margins_count;
       if (least_margin<M>(constants, &time, there, rates[stage + 1], side, margins) < 0.0)
         negative = least(negative, M::template place<stage>());
     }
-    take_stages<M, stage + 1>(constants, from, state, side, length, rates, watched, negative);
+    take_stages<M, stage + 1, watches>(constants, from, state, side, length, rates, watched, negative);
   }
 }
 
@@ -81,7 +81,7 @@ DEVICE void try_step(const double* constants, double from, const double* state, 
   double* const middle = watched + rows * m;
   UNROLLED for (int k = 0; k < m; k++) watched[k] = margins[k];
   UNROLLED for (int k = 0; k < n; k++) rates[0][k] = rate[k];
-  take_stages<M, 0>(constants, from, state, side, length, rates, watched, negative);
+  take_stages<M, 0, true>(constants, from, state, side, length, rates, watched, negative);
   UNROLLED for (int k = 0; k < n; k++) end[k] = state[k] + length * M::template sum<stages>(rates, k);
   M::field(constants, &time, end, last);
   UNROLLED for (int k = 0; k < n; k++) {
@@ -94,9 +94,36 @@ DEVICE void try_step(const double* constants, double from, const double* state, 
   tried[3 * n + 1] = negative;
 }
 
-// Run one smooth motion, whose constants and lane are given, to its end.
+// The state at a time within a step, by a shorter step from the same start.
 template <class M>
-DEVICE void run_motion(double* start) {
+DEVICE void within(const double* constants, double from, const double* state, const double* rate, double length, double* there) {
+  double rates[M::stages + 2][M::components], negative;
+  UNROLLED for (int k = 0; k < M::components; k++) rates[0][k] = rate[k];
+  take_stages<M, 0, false>(constants, from, state, 1.0, length, rates, there, negative);
+  UNROLLED for (int k = 0; k < M::components; k++) there[k] = state[k] + length * M::template sum<M::stages>(rates, k);
+}
+
+// The samples of a run: their times, how many there are, the next one, and where their values go, each `stride` after the last.
+struct Samples {
+  const double* times;
+  int count, next;
+  double* values;
+  long long stride;
+
+  // Write the samples up to a time, and `read` each.
+  template <int size, class Read>
+  DEVICE void write(double until, Read read) {
+    for (; next < count && times[next] <= until; next++) {
+      double row[size];
+      read(times[next], row);
+      for (int k = 0; k < size; k++) values[((long long)next * size + k) * stride] = row[k];
+    }
+  }
+};
+
+// Run one smooth motion, whose constants and lane are given, to its end.
+template <class M, class Record>
+DEVICE void run_motion(double* start, Record record) {
   constexpr int n = M::components, m = M::margins_count;
   // Copies, which stay in registers: called functions have written and will read the originals.
   double constants[M::constants], lane[M::lane_size];
@@ -107,18 +134,45 @@ DEVICE void run_motion(double* start) {
     M::length(constants, lane, &length);
     try_step<M>(constants, lane[M::lane_time], lane + M::lane_state, lane + M::lane_rate, lane + M::lane_margins,
                 lane[M::lane_side], length, tried);
+    const double from = lane[M::lane_time];
+    double state[n], rate[n];
+    UNROLLED for (int k = 0; k < n; k++) state[k] = lane[M::lane_state + k], rate[k] = lane[M::lane_rate + k];
     M::after(constants, lane, &length, tried, lane);
+    if (lane[M::lane_time] > from) record(constants, from, state, rate, lane[M::lane_time]);
   }
   UNROLLED for (int k = 0; k < M::lane_size; k++) start[M::constants + k] = lane[k];
 }
+
+// In place of a function that keeps the accepted steps.
+struct NoRecord {
+  DEVICE void operator()(const double*, double, const double*, const double*, double) const {}
+};
 
 // Run a smooth problem from its start to its end.
 template <class M>
 DEVICE void run_smooth(const double* values, double* outcome) {
   double start[M::constants + M::lane_size];
   M::begin(values, start);
-  run_motion<M>(start);
+  run_motion<M>(start, NoRecord());
   M::ended(start, start + M::constants, values, outcome);
+}
+
+// Run a smooth problem, and sample it; samples after the end are NaN.
+template <class M>
+DEVICE void run_sampled(const double* values, double* outcome, Samples samples) {
+  double start[M::constants + M::lane_size];
+  M::begin(values, start);
+  const double* const first = start + M::constants + M::lane_state;
+  samples.write<M::quantities>(0.0, [=](double, double* row) { M::read(values, first, row); });
+  run_motion<M>(start, [&](const double* constants, double from, const double* state, const double* rate, double until) {
+    samples.write<M::quantities>(until, [=](double time, double* row) {
+      double there[M::components];
+      within<M>(constants, from, state, rate, time - from, there);
+      M::read(values, there, row);
+    });
+  });
+  M::ended(start, start + M::constants, values, outcome);
+  samples.write<M::quantities>(Infinity, [](double, double* row) { for (int k = 0; k < M::quantities; k++) row[k] = NaN; });
 }
 
 // One round: a mode to its end, and the transition, which is instantaneous or goes through flights that end with impacts.
@@ -126,7 +180,7 @@ template <class M>
 DEVICE void one_round(const double* values, double* runs) {
   double start[M::constants + M::lane_size];
   M::begin(values, runs, start);
-  run_motion<M>(start);
+  run_motion<M>(start, NoRecord());
   M::ended(start, start + M::constants, values, runs, runs);
   if (runs[M::runs_status] != M::left) return;
   if constexpr (M::most_hops == 0) {

@@ -102,11 +102,13 @@ class SmoothRuns(NamedTuple):
 
     - `start`: function of the numbers of a run that returns the problem, for one cell, the horizon [s] and the settings.
     - `passes`, `n_blocks`: `nonterminal` and `n_blocks` of `solve_ensemble`.
+    - `read`: function of the numbers of a run and of a state that returns what is sampled; `None` without samples.
     """
 
     start: Callable[[PyTree], tuple[AbstractProblem, Float[Array, "..."], Settings]]
     passes: bool
     n_blocks: int = 1
+    read: Callable[[PyTree, Float[Array, "components 1"]], PyTree] | None = None
 
     def part(self, values: PyTree) -> Part:
         """The program of a run, whose last function returns the `Outcome`. **Arguments:** `values`: an example."""
@@ -122,7 +124,12 @@ class SmoothRuns(NamedTuple):
             outcome = back_to_margin(problem, outcome_of(lane))
             return outcome if self.passes else with_crossing_times(problem, outcome)
 
-        return steps_of(begin, end, (values,), eqx.filter_eval_shape(self.start, values)[2])
+        part = steps_of(begin, end, (values,), eqx.filter_eval_shape(self.start, values)[2])
+        if self.read is not None:
+            state = jax.ShapeDtypeStruct((part.facts["components"], 1), jnp.result_type(float))
+            part.functions["read"] = (self.read, (values, state))
+            part.facts["quantities"] = size_of(eqx.filter_eval_shape(self.read, values, state))
+        return part
 
 
 class HybridStart(NamedTuple):

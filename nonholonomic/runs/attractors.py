@@ -444,6 +444,8 @@ KINDS = ("min", "max", "change", "range")
 class Ranges(Samples):
     """The ranges of quantities in the last quarter of runs, how they change from the quarter before, and in whole runs."""
 
+    has_kernel = False
+
     def variables(self, model: AbstractModel) -> dict[str, Variable]:
         """The variables of the table with the ranges."""
         return {

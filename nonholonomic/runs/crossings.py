@@ -222,7 +222,7 @@ class Crossings(Samples):
     """The crossings in a table: their numbers, counted from 1, in place of times; the names of the quantities; and whether the
     states are those after the resets at the section."""
 
-    along = ("crossing", "1")
+    along, has_kernel = ("crossing", "1"), False
 
     after: bool = False
 

@@ -18,6 +18,7 @@ from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
 from ..integration.problem import Status, legal_run, require_times
 from ..integration.samples import Times
 from ..integration.scheduler import of_cells
+from ..kernels import by_kernel, solve_smooth_with_samples
 from ..sweeps import Axis, Variable
 from ..terminal import status_line
 from ..validation import as_known, as_number, explaining, is_traced, nan_unless, warn
@@ -38,6 +39,9 @@ class Samples:
 
     #: The name and the unit of the axis along the samples.
     along: ClassVar[tuple[str, str]] = ("time", "s")
+
+    #: Whether a kernel can take these samples of smooth runs.
+    has_kernel: ClassVar[bool] = True
 
     times: Num[np.ndarray, " times"]
     names: tuple[str, ...]
@@ -65,13 +69,34 @@ class Samples:
         names, times = self.names, jnp.asarray(self.times, float)
         horizon = (jnp.asarray(t1, float), jnp.asarray(count), settings)
         if cells.smooth:
-            outcome, status, values = _followed(problem_of(cells, size, names), cells, names, times, horizon)
+            problem, read = problem_of(cells, size, names), OfOneRun(cells, names)
+
+            def solve(gpu: Any) -> tuple[Outcome, dict[str, Array]]:
+                return solve_smooth_with_samples(problem, self.times, *horizon, run=gpu, read=read)
+
+            solved = by_kernel(solve, size, settings.device)
+            if solved is None:
+                outcome, status, values = _followed(problem, cells, names, times, horizon)
+            else:
+                outcome, values = solved
+                status = cells.ended(outcome, settings.tolerance)
             values |= counted(cells, outcome)
         else:
             start, counters = modes_of(cells, size, settings.tolerance, names), len(cells.counters)
             run, _ = solve_hybrid_with_samples(*start, times, *horizon, counters=counters)
             status, values = _read_samples(cells, names, times, run, settings.tolerance)
         return status, jax.tree.map(np.asarray, values)
+
+
+class OfOneRun(eqx.Module):
+    """The named quantities of a state of one run, (components, 1), of a model whose numbers have the run in their last axis."""
+
+    model: AbstractModel
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, state: Float[Array, "components 1"]) -> dict[str, Array]:
+        model = of_cells(self.model, 0)
+        return model.read(self.names, jnp.asarray(jnp.nan), state[:, 0], None)
 
 
 # Compiled on its own, not inside other transformed functions; otherwise it does not get the compiler's options.

@@ -311,16 +311,18 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
     cells, is_scene = size_of(grid), isinstance(job.model, AbstractSceneModel)
     chunk = None if is_scene or cells <= 4 * LEAST_CHUNK else max(LEAST_CHUNK, chunk_for(cells))
-    if job.samples is None and gpu_for(cells, options.device) is not None:
+    has_kernel = job.has_kernel
+    if uses_kernel := has_kernel and gpu_for(cells, options.device) is not None:
         chunk = min(CELLS_OF_KERNEL, 1 << (cells - 1).bit_length())
     inner, most = [], None
     if job.samples is not None:
         request |= {"quantities": list(job.samples.names)}
         inner = job.samples.inner(job.model)
-        # A run has about a dozen components.
-        most = max(16, 1 << (MOST_SAMPLED // (12 * len(job.samples.times))).bit_length() - 1)
+        # A run has about a dozen components. A kernel keeps the quantities alone, most of which have up to three.
+        numbers = (3 * len(job.samples.names) if uses_kernel else 12) * len(job.samples.times)
+        most = max(16, 1 << (MOST_SAMPLED // numbers).bit_length() - 1)
     running = {"path": options.path, "progress": options.progress, "executor": options.executor}
-    with place_of_jax(cells, options.device, job.samples is None):
+    with place_of_jax(cells, options.device, has_kernel):
         table = sweeps.sweep(job, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
     illegal = cells_with(table, "status", Status.ILLEGAL.word)
     if len(illegal):

@@ -95,6 +95,11 @@ class TableJob(NamedTuple):
         return self.crossing != "first" or own
 
     @property
+    def has_kernel(self) -> bool:
+        """Whether a kernel can run the cells."""
+        return self.samples is None or (self.samples.has_kernel and self.model.smooth)
+
+    @property
     def variables(self) -> dict[str, Variable]:
         """The variables of the table, without derivatives."""
         if not self.timed:
@@ -141,7 +146,7 @@ class TableJob(NamedTuple):
             job = self._replace(listed=())
             return job(dict(zip(numbers, values, strict=True)), count) | dict(zip(names, values, strict=True))
         size = next((len(values) for values in columns.values()), 1)
-        with place_of_jax(size, self.settings.device, self.samples is None):
+        with place_of_jax(size, self.settings.device, self.has_kernel):
             return self._of_cells(columns, count)
 
     def _of_cells(self, columns: dict[str, Any], count: int) -> dict[str, Any]:

@@ -482,6 +482,7 @@ def trajectory_table(
     path: str | Path | None = None,
     progress: bool = True,
     executor: Executor | None = None,
+    device: str | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
     solver: diffrax.AbstractERK | None = None,
 ) -> Table:
@@ -506,7 +507,7 @@ def trajectory_table(
       [rad/s], "grip" [1] and "reaction" [N]; all as in `Trajectory` and `HybridTrajectory`.
     - `tolerance`: relative tolerance of the integration.
     - `path`: HDF5 file to write, chunk by chunk. Repeat the same call to resume an interrupted table.
-    - `progress`, `executor`: as for `inversion_table`.
+    - `progress`, `executor`, `device`: as for `inversion_table`.
     - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1.
     - `solver`: as for `inversion_table`.
 
@@ -538,7 +539,7 @@ def trajectory_table(
     require_times(as_number(times), None)
     samples = samples_of(quantities_of(scene), times, quantities, None)
     assert samples is not None
-    options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor)
+    options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor, device=device)
     settings, t1 = options.settings, samples.times[-1]
     require(t1, "times[-1]", above=0.0, why="it is the horizon")
     launch_values = {"launch": launch, "theta": theta, "eta": eta, "mu": mu, "spin": spin}
