@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,8 @@ from .ensemble import (
 )
 from .saltation import Tangents, VariationalMode, with_variations
 
-#: The modes, the index of the first mode of every cell, and the initial states.
+#: The runs of many cells; and the modes, the index of the first mode of every cell, and the initial states.
+Runs: TypeAlias = HybridOutcome[Array]
 Built = tuple[Modes, Int[Array, " cells"], States]
 
 #: The times of samples in every cell [s]; and the factors of the output rows there, if only a sum of them is needed.
@@ -144,12 +145,7 @@ class Recorded(NamedTuple):
 
 
 def sampled_rounds(
-    modes: tuple[VariationalMode, ...],
-    start: HybridOutcome[Array],
-    times: CellTimes,
-    t1: Lanes,
-    settings: Settings,
-    n_blocks: int,
+    modes: tuple[VariationalMode, ...], start: Runs, times: CellTimes, t1: Lanes, settings: Settings, n_blocks: int
 ) -> tuple[Carry, list[tuple[int, ...]], Advance, Advance]:
     """The rounds of `solve_hybrid` with samples of every mode and of the transition to the next.
 
@@ -186,9 +182,7 @@ def sampled_rounds(
         grazing_time = jnp.where(grazes, jnp.minimum(output.grazing_time, runs.end_time), output.grazing_time)
         return after, output._replace(grazing_time=grazing_time)
 
-    def _reset(
-        numbers: Sequence[int], cell: Int[Array, " cells"], runs: HybridOutcome[Array]
-    ) -> tuple[Transition, Array | None]:
+    def _reset(numbers: Sequence[int], cell: Int[Array, " cells"], runs: Runs) -> tuple[Transition, Array | None]:
         """The transition of some cells, and its output rows with their variations."""
         horizon = t1[cell]
 

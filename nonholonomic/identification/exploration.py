@@ -166,10 +166,8 @@ def fitted(points: Points, weights: PerPoint, components: int, random: np.random
 
 
 def squared_distances(
-    points: Points,
-    centres: Float[np.ndarray, "*components unknowns"],
-    roots: Float[np.ndarray, "*components unknowns unknowns"],
-) -> tuple[Float[np.ndarray, "*components n"], Float[np.ndarray, "*components"]]:
+    points: Points, centres: Float[np.ndarray, "*parts unknowns"], roots: Float[np.ndarray, "*parts unknowns unknowns"]
+) -> tuple[Float[np.ndarray, "*parts n"], Float[np.ndarray, "*parts"]]:
     """Squared distances of points from centres in units of the covariances, and logarithms of the roots' determinants."""
     off = np.linalg.inv(roots) @ (points.T - centres[..., None])
     return np.sum(off**2, axis=-2), np.sum(np.log(np.abs(np.diagonal(roots, axis1=-2, axis2=-1))), axis=-1)

@@ -323,10 +323,8 @@ def growth_of_model(
         logarithm, ended = growth(model.problem(cells, model.comparable), tangents, t1, STRETCHES, settings)
     else:
         logarithm, ended = _through_modes(model, tangents, t1, settings)
-    return logarithm, ended, np.asarray(_ended(model, jax.tree.map(jnp.asarray, ended), settings.tolerance))
-
-
-_ended = eqx.filter_jit(lambda model, outcome, tolerance: model.ended(outcome, tolerance))
+    status = eqx.filter_jit(model.ended)(jax.tree.map(jnp.asarray, ended), settings.tolerance)
+    return logarithm, ended, np.asarray(status)
 
 
 def _through_modes(

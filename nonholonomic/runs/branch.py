@@ -18,18 +18,7 @@ from ..terminal import status_line
 from ..text import counted, shown
 from ..validation import is_traced, require, require_outside, require_package, require_whole
 from ..views.plot import new_figure
-from .continuation import (
-    ASIDE,
-    CROSSING,
-    DOUBLING,
-    ILLEGAL,
-    OF_A_FAMILY,
-    RANK,
-    REGULAR,
-    STEPS,
-    Continuation,
-    NoPoint,
-)
+from . import continuation
 
 # Only for type checkers: xarray is optional.
 if TYPE_CHECKING:
@@ -89,7 +78,7 @@ class Orbit(eqx.Module):
         distances = jnp.abs(self.multipliers - 1.0)
         nearest = jnp.argsort(jnp.argsort(distances, axis=-1), axis=-1)
         # Round-off splits a double multiplier by the square root of its error.
-        is_own = (nearest < 2 * jnp.asarray(self.family)[..., None]) & (distances < RANK**0.5)
+        is_own = (nearest < 2 * jnp.asarray(self.family)[..., None]) & (distances < continuation.RANK**0.5)
         return jnp.all(is_own | (jnp.abs(self.multipliers) < 1.0 - ON_CIRCLE), axis=-1)
 
     @property
@@ -98,7 +87,7 @@ class Orbit(eqx.Module):
         if np.ndim(self.reason):
             raise ValueError("status is that of a single orbit; the orbits of a batch have `reason`, an array")
         reason = int(self.reason)
-        return "illegal" if reason == ILLEGAL else "unresolved" if reason else "completed"
+        return "illegal" if reason == continuation.ILLEGAL else "unresolved" if reason else "completed"
 
     @status_line("following a branch")
     def branch(
@@ -152,7 +141,7 @@ class Orbit(eqx.Module):
         if step is not None:
             require(step, "step", above=0.0)
         course, full = continuation_of(self, name, until, period)
-        largest = 1.0 / STEPS if step is None else min(float(step) / abs(course.last - course.first), 0.5)
+        largest = 1.0 / continuation.STEPS if step is None else min(float(step) / abs(course.last - course.first), 0.5)
         visited, kinds, end = course.followed(largest, points)
         values = jnp.asarray([point.value for point in visited])
         orbits = jax.tree.map(lambda *parts: jnp.asarray(np.stack(parts)), *(point.orbit for point in visited))
@@ -257,7 +246,7 @@ class Branch(eqx.Module):
     @property
     def special(self) -> list[SpecialPoint]:
         """The special points, in the order of the branch."""
-        places = [k for k, kind in enumerate(self.kinds) if kind != REGULAR]
+        places = [k for k, kind in enumerate(self.kinds) if kind != continuation.REGULAR]
         return [SpecialPoint(self.kinds[k], float(self.values[k]), self.orbit(k)) for k in places]
 
     @status_line("looking for a branch")
@@ -271,7 +260,8 @@ class Branch(eqx.Module):
         **Raises:** `ValueError` if there is no such point, and if no orbit of the other branch is found near it.
         """
         special = self.special
-        allowed = [place for place, point in enumerate(special) if point.kind in (DOUBLING, CROSSING)]
+        switchable = continuation.DOUBLING, continuation.CROSSING
+        allowed = [place for place, point in enumerate(special) if point.kind in switchable]
         k = allowed[0] if k is None and allowed else k
         if k not in allowed:
             kinds = ", ".join(point.kind for point in special) or "none"
@@ -283,25 +273,25 @@ class Branch(eqx.Module):
         begin = course.begin
         try:
             old = course.corrected(begin, np.eye(len(begin))[-1])
-        except NoPoint as error:
+        except continuation.NoPoint as error:
             raise ValueError(f"the special point is no orbit: {error}") from None
-        if kind == DOUBLING:
+        if kind == continuation.DOUBLING:
             values, vectors = np.linalg.eig(old.jacobian)
             aside = np.append(np.real(vectors[list(orbit.search.free), np.argmin(np.abs(values + 1.0))]), 0.0)
             course = course._replace(returns=2 * course.returns)
         else:
             # In the plane of both branches, across this one.
-            place = [j for j, word in enumerate(self.kinds) if word != REGULAR][k]
+            place = [j for j, word in enumerate(self.kinds) if word != continuation.REGULAR][k]
             states, values = (np.asarray(part[place + 1] - part[place - 1]) for part in (self.states, self.values))
             along = np.append(states[list(orbit.search.free)] / course.scale, values / (course.last - course.first))
             plane = np.linalg.svd(old.matrix)[2][-2:]
             aside = plane.T @ np.linalg.svd((plane @ along)[None])[2][-1]
         aside = aside / np.linalg.norm(aside)
         reason = ""
-        for distance in ASIDE:
+        for distance in continuation.ASIDE:
             try:
                 return jax.tree.map(jnp.asarray, course.corrected(begin + distance * aside, aside).orbit)
-            except NoPoint as error:
+            except continuation.NoPoint as error:
                 reason = str(error)
         raise ValueError(f"no orbit of the other branch was found near {self.name} = {value:.10g}: {reason}")
 
@@ -363,7 +353,7 @@ class Branch(eqx.Module):
             part, style = slice(begin, end + 1), "-" if edges[begin] else "--"
             panel.plot(x[part], y[part], style, color="C0", label=None if named else label)
         for k, kind in enumerate(self.kinds):
-            if kind != REGULAR:
+            if kind != continuation.REGULAR:
                 panel.plot(x[k], y[k], "o", color="C3", markersize=4)
                 # Beside the line, towards the middle of the picture.
                 is_right, (old, new) = x[k] > np.mean(panel.get_xlim()), (max(k - 1, 0), min(k + 1, len(x) - 1))
@@ -382,7 +372,7 @@ class Branch(eqx.Module):
         lines = [f"branch of periodic orbits over {name}, {count} from {values[0]:.8g} to {values[-1]:.8g}"]
         changes = [0, *(np.flatnonzero(np.diff(stable)) + 1)]
         # At a special point, an orbit may count as either.
-        starts = [k - (k > 0 and self.kinds[k - 1] != REGULAR) for k in changes]
+        starts = [k - (k > 0 and self.kinds[k - 1] != continuation.REGULAR) for k in changes]
         for k, begin, end in zip(changes, starts, [*starts[1:], len(values) - 1], strict=True):
             lines.append(f"{'stable' if stable[k] else 'unstable'} from {values[begin]:.8g} to {values[end]:.8g}")
         for kind, value, orbit in self.special:
@@ -392,7 +382,7 @@ class Branch(eqx.Module):
 
 def continuation_of(
     orbit: Orbit, name: str, until: float, period: Callable[[Array], Array] | None
-) -> tuple[Continuation, str]:
+) -> tuple[continuation.Continuation, str]:
     """The continuation of an orbit, checked, and the full name of the number. **Arguments:** as for `Orbit.branch`."""
     require_outside((orbit, until), "branch", "the derivatives of periodic_orbit")
     if np.ndim(orbit.reason):
@@ -402,7 +392,7 @@ def continuation_of(
     if orbit.search is None or int(orbit.reason):
         raise ValueError("branch needs an orbit that periodic_orbit has found in this process")
     if int(orbit.family) and len(orbit.search.free) == len(orbit.names):
-        raise ValueError(OF_A_FAMILY)
+        raise ValueError(continuation.OF_A_FAMILY)
     require(until, "until")
     search, model = orbit.search, orbit.search.model(orbit.leaves)
     known = [full for full in model.known if not full.startswith(("start", "launch"))]
@@ -442,7 +432,7 @@ def continuation_of(
             raise ValueError(f"period({first:.10g}) = {horizon:.10g} s must be that of the drive, {expected:.10g} s")
     largest = float(np.abs(np.asarray(orbit.state)).max())
     scale = largest if largest > SMALLEST_SCALE else 1.0
-    course = Continuation(orbit, others, period, first, float(until), scale, orbit.returns)
+    course = continuation.Continuation(orbit, others, period, first, float(until), scale, orbit.returns)
     if search.is_driven and model.symmetry is None and not course.repeats():
         raise ValueError(
             f"period: where {name} = {until:.10g}, the drive does not repeat after "

@@ -342,9 +342,7 @@ class Dynamics(eqx.Module):
             force = self.normal_force(normal, self.surface.normal_rate(place, velocity), velocity)
         return jnp.broadcast_to(multiply(1.0, force), state[0].shape)
 
-    def side_force(
-        self, t: Float[Array, "..."], state: State, controls: Input | None
-    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    def side_force(self, t: Number, state: State, controls: Input | None) -> tuple[Number, Number]:
         """Side forces [N] of the ground on the rear axle and on the front wheel, to the left of each; with the projected
         heading on curved ground, they act horizontally.
 

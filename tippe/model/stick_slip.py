@@ -25,6 +25,7 @@ from nonholonomic.integration import Components, Lanes, States
 from nonholonomic.integration.dense import halved
 
 from ..friction import Frictionless, Slip, length
+from .body import Number
 from .dynamics import FITS, AbstractContactDynamics, Dynamics, Motion, RollingDynamics
 from .rigid import RigidRolling, RigidSlipping
 
@@ -102,9 +103,7 @@ class Onset(eqx.Module):
         powers = jnp.stack([fraction**k for k in range(STAGES + 1)])
         return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
 
-    def falls_to_zero(
-        self, event: Callable[[States], Float[Array, "..."]], first: Float[Array, "..."]
-    ) -> Float[Array, "..."]:
+    def falls_to_zero(self, event: Callable[[States], Number], first: Number) -> Number:
         """The fraction of the step, after `first`, at which a function of the state falls to zero; 1 if it does not fall
         so far."""
         bracket = halved(lambda part: event(self.at(part)) > 0.0, first, jnp.ones_like(first))

@@ -31,7 +31,7 @@ from nonholonomic.integration import AbstractProblem, Lanes, Outcome, Settings, 
 from nonholonomic.integration.problem import LEFT_DOMAIN, MOST_STEPS
 
 from ..friction import AbstractFriction, SetValuedCoulomb, Slip, length
-from ..model.body import ContactGeometry, Top
+from ..model.body import ContactGeometry, Number, Top
 from ..model.dynamics import AbstractDynamics, Dynamics, angular_velocity, joined, parts
 from ..model.scene import Scene
 from ..model.stick_slip import StickSlip
@@ -136,9 +136,7 @@ def axis_rate(body: Top, axis: Vector, momentum: Vector) -> Vector:
     return scale(1.0 / body.I1, cross(momentum, axis))
 
 
-def still_parting(
-    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Lanes | float = 0.0
-) -> Float[Array, "..."]:
+def still_parting(rate: Number, gravity: Number, radius: Number, rounding: Lanes | float = 0.0) -> Number:
     """The round-off allowed for the distance of a sphere, as a fraction of R.
 
     The full allowance holds while the sphere lifts off. There is none when the sphere returns, because it would delay

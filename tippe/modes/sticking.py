@@ -12,7 +12,7 @@ from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
 from nonholonomic.integration import AbstractProblem, ExtendedProblem, Lanes, States
 from nonholonomic.integration.problem import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 
-from ..model.body import Top
+from ..model.body import Number, Top
 from ..model.dynamics import COS_THETA, PLACE, AbstractDynamics, parts
 from ..model.rigid import AbstractRigidBody
 from ..model.scene import Scene
@@ -191,9 +191,7 @@ def energy_in(scene: Scene, state: States, mode: Int[Array, " cells"]) -> tuple[
     return total, total
 
 
-def lifted(
-    scene: Scene[Top], state: Float[Array, "components ..."], distance: ArrayLike, rate: ArrayLike
-) -> Float[Array, "..."]:
+def lifted(scene: Scene[Top], state: States, distance: ArrayLike, rate: ArrayLike) -> Number:
     """Difference [J] between the energy of a flying top and that of the same state in contact; `distance` [m] is that
     of its sphere from the ground, and `rate` [m/s] the rate of this distance."""
     _, e, L, place = parts(state)

@@ -327,11 +327,6 @@ def simulate_launch(
     return run.resampled(times_reached)
 
 
-@eqx.filter_jit
-def _ended(model: Any, outcome: HybridOutcome[Array], tolerance: Float[Array, ""]) -> Array:
-    return model.ended(outcome, tolerance)[0]
-
-
 def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> Any:
     """The run along its path, at the times of its steps. A run whose energy does not balance the work of friction and
     impacts ends as "unresolved"."""
@@ -345,7 +340,8 @@ def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> A
     outcome = HybridOutcome(
         none + path.status, inf, one, state, none, none, np.stack([inf, one, one]), none + last_mode, none[None]
     )
-    status = Status(int(_ended(model, jax.tree.map(jnp.asarray, outcome), jnp.asarray(tolerance)))).word
+    (ended,) = np.asarray(eqx.filter_jit(model.ended)(jax.tree.map(jnp.asarray, outcome), jnp.asarray(tolerance)))
+    status = Status(int(ended)).word
     # The states and what else has a value for each time come next.
     run = kind(times, scene, rows, rows, times, times, status, end, dense=path, start=start, launch=model.launch)
     # NumPy slices the states, because JAX would compile each slice again for every number of steps.
