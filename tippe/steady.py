@@ -49,6 +49,9 @@ from .model.scene import Launch, Scene
 
 # Checks of the arguments of steady motions; traced numbers pass.
 
+#: A number or an array.
+Number = Float[ArrayLike, "..."]
+
 #: Advice in messages about lists, and about what is no motion.
 MANY, A_MOTION = "jax.vmap maps over several", ", as tumbling(scene, theta) returns it"
 
@@ -108,7 +111,7 @@ class Tumbling(NamedTuple):
     jellett: Float[Array, "..."]
 
 
-def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
+def tumbling(scene: Scene[Top], theta: Number) -> Tumbling:
     """The tumbling top at an inclination; of the two solutions, the one with positive phi'.
 
     phi'^2 = m g a / D, omega3 = (cos - alpha) phi', J = R G phi', with D = I3 (alpha - cos) + I1 cos and
@@ -135,7 +138,7 @@ def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
     return Tumbling(theta, precession, spin, scene.body.radius * inertia * precession)
 
 
-def tumbling_is_stable(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+def tumbling_is_stable(scene: Scene[Top], theta: Number) -> Float[Array, "..."]:
     """Whether the tumbling top is stable: J^2 grows with theta, that is, 4 D^2 + G (I1 - I3) > 0.
 
     **Example:** with the scene of the module.
@@ -147,9 +150,7 @@ def tumbling_is_stable(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Flo
     return 4.0 * lever**2 + inertia * (scene.body.I1 - scene.body.I3) > 0.0
 
 
-def effective_energy(
-    scene: Scene[Top], theta: Float[ArrayLike, "..."], jellett: Float[ArrayLike, "..."]
-) -> Float[Array, "..."]:
+def effective_energy(scene: Scene[Top], theta: Number, jellett: Number) -> Float[Array, "..."]:
     """Least energy [J] of a top with the given inclination and Jellett's constant: J^2 / (2 R^2 G) + m g (R - a cos).
 
     Its extrema over theta are the steady motions, and its minima are the stable motions.
@@ -232,7 +233,7 @@ def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
     return joined((-u2, u1), (-e2, e1, zero), (-L2, L1, zero))
 
 
-def _lever_and_inertia(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> tuple[Array, Array]:
+def _lever_and_inertia(scene: Scene[Top], theta: Number) -> tuple[Array, Array]:
     """D = I3 (alpha - cos) + I1 cos and G = I1 sin^2 + I3 (cos - alpha)^2 [kg m^2].
 
     **Raises:** `ValueError` unless this is a scene on the plane, and theta an angle [rad] in [0, pi], or several.

@@ -16,7 +16,7 @@ from ..integration import AbstractProblem, CoreProblem, Outcome, Settings, State
 from ..integration.problem import LEFT_DOMAIN, event_time
 from ..validation import as_number
 from .adjoint import SampledCotangents, samples_pulled_back
-from .differentiable import AbstractDifferentiableSolve, Structure, differentiable_solve
+from .differentiable import AbstractDifferentiableSolve, Leaves, Structure, differentiable_solve
 from .variation import Tangent, Tangents, VariationalProblem, by_active, in_groups, probed, tangent_along, tangents_by
 
 # Samples of a run as a differentiable solve: its leaves, and how they are assembled into a problem.
@@ -61,7 +61,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
         """What the backward pass differentiates: functions of what is run and of its states, and both arguments."""
         return []
 
-    def prefers_adjoint(self, active: tuple[int, ...], leaves: tuple[Array, ...]) -> bool:
+    def prefers_adjoint(self, active: tuple[int, ...], leaves: Leaves) -> bool:
         if sum(leaves[k].size for k in active) <= self.most_forward:
             return False
         typed = [jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
@@ -90,18 +90,14 @@ class AbstractSampling(AbstractDifferentiableSolve):
         samples, slopes = in_groups(lambda group: self.sampled(built, group, options, nested), tangents)
         return samples, gather(slopes)
 
-    def push_forward(
-        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
-    ) -> PyTree:
+    def push_forward(self, active: tuple[int, ...], cells: int, leaves: Leaves, tangents: tuple[Array, ...]) -> PyTree:
         build, numbers, options, _ = self.builder(cells, leaves)
         directions = [_cells_last(part, self.axes[k], cells) for k, part in zip(active, tangents, strict=True)]
         built, direction, size = tangent_along(build, active, numbers, tuple(directions), cells)
         _, (slope,) = self.sampled(built, (direction,), options, False)
         return jax.tree.map(lambda part: part * size.reshape(-1, *[1] * (part.ndim - 1)), slope)
 
-    def builder(
-        self, cells: int, leaves: tuple[Array, ...]
-    ) -> tuple[Callable[..., PyTree], tuple[Array, ...], Options, int | None]:
+    def builder(self, cells: int, leaves: Leaves) -> tuple[Callable[..., PyTree], Leaves, Options, int | None]:
         """What the leaves stand for.
 
         **Returns:** a function (the modules' numbers, cells) -> problem; the modules' numbers, in a block scalars or with
@@ -341,7 +337,7 @@ class BlockSampling(AbstractSampling):
         return [(rates, built, built.start()[0])]
 
     def pull_back(
-        self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: SampledRun
+        self, active: tuple[int, ...], cells: int, leaves: Leaves, cotangents: SampledRun
     ) -> list[Float[Array, "cells ..."]]:
         solve = dataclasses.replace(self, core_only=True) if cotangents.quadratures is None else self
         build, numbers, (times, t1, settings, _), _ = solve.builder(cells, leaves)

@@ -670,9 +670,11 @@ def read_launches(
     )
 
 
-def _times_of_launches(
-    file: TextTable, never: str | Sequence[str]
-) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+#: A number for each line of a file.
+OfLines = Float[np.ndarray, " lines"]
+
+
+def _times_of_launches(file: TextTable, never: str | Sequence[str]) -> tuple[OfLines, OfLines]:
     """The times of all lines, infinite where the event did not happen, and the limits that the file states."""
     words = (never,) if isinstance(never, str) else never
     if not isinstance(words, tuple | list) or not all(isinstance(word, str) for word in words):

@@ -28,6 +28,10 @@ from .scheduler import NO_EXTREMES, Outcome
 
 Brackets = Float[np.ndarray, " zeros"]
 
+#: A time or a length of time [s]; and other numbers, one or several.
+Time = Float[Array, ""]
+Number = Float[Array, "..."]
+
 #: Halvings that reduce any bracket to round-off.
 HALVINGS = 60
 
@@ -48,9 +52,7 @@ CLOSER_LOOKS = 3
 CLOSEST = 1e-14
 
 
-def halved(
-    holds: Callable[[Float[Array, "..."]], Bool[Array, "..."]], low: Float[Array, "..."], high: Float[Array, "..."]
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+def halved(holds: Callable[[Number], Bool[Array, "..."]], low: Number, high: Number) -> tuple[Number, Number]:
     """Find where a condition ceases to hold, by halving brackets; also inside transformations.
 
     **Arguments:**
@@ -267,7 +269,7 @@ Start = tuple[Float[Array, " components"], Float[Array, " components"]]
 
 
 @eqx.filter_jit
-def _start(problem: AbstractProblem, time: Float[Array, ""]) -> tuple[Start, Float[Array, ""] | None]:
+def _start(problem: AbstractProblem, time: Time) -> tuple[Start, Time | None]:
     """State, scales and domain margin at the start: one program, where JAX would compile each of their operations."""
     state, scales = problem.start()
     return (jnp.asarray(state), jnp.asarray(scales)), problem.margin_at_start(time, state)
@@ -327,9 +329,7 @@ def _piece(
     return solution, _first_losses(problem, solution, begin) if is_watched else None
 
 
-def _first_losses(
-    problem: AbstractProblem, solution: diffrax.Solution, t0: Float[Array, ""]
-) -> Float[Array, "steps 2"]:
+def _first_losses(problem: AbstractProblem, solution: diffrax.Solution, t0: Time) -> Float[Array, "steps 2"]:
     """Brackets [s] of the first zero of the domain margin in every step, infinite where there is none."""
     ends, _ = saved(solution)
     lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
@@ -422,9 +422,7 @@ def follow(
 
 
 @eqx.filter_jit
-def _loss(
-    problem: AbstractProblem, solution: diffrax.Solution, begin: Float[Array, ""], end: Float[Array, ""]
-) -> Float[Array, ""]:
+def _loss(problem: AbstractProblem, solution: diffrax.Solution, begin: Time, end: Time) -> Time:
     """The last time in a bracket before the domain margin becomes negative, on the dense output."""
     return halved(lambda time: ~(problem.margin_or_one(time, solution.evaluate(time)) < 0.0), begin, end)[0]
 
@@ -457,7 +455,7 @@ def _nan_if_moved(primals, tangents):
 def sample(
     problem: AbstractProblem,
     times: Float[Array, " times"] | None,
-    t1: Float[Array, ""],
+    t1: Time,
     settings: Settings,
     *,
     grid: Float[Array, " steps"] | None = None,
@@ -523,7 +521,7 @@ def sample(
 
 
 @eqx.filter_jit
-def solve_by_diffrax(problem: AbstractProblem, t1: Float[Array, ""], settings: Settings) -> Outcome:
+def solve_by_diffrax(problem: AbstractProblem, t1: Time, settings: Settings) -> Outcome:
     """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
 
     The domain margin is checked at the ends of steps, so a short loss can be missed; events are located on Diffrax's
@@ -581,7 +579,7 @@ class ImplicitMidpoint(diffrax.AbstractSolver):
     ```
     """
 
-    step_length: Float[Array, ""] = eqx.field(converter=as_known)
+    step_length: Time = eqx.field(converter=as_known)
 
     units: ClassVar[dict[str, str]] = {"step_length": "s"}
     term_structure: ClassVar = diffrax.AbstractTerm

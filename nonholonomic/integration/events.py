@@ -28,6 +28,14 @@ LOCATED = 1e-10
 MOST_TRIALS = 64
 
 
+#: Places in a step, as fractions of it; margins there, of one event or of several.
+Places = Float[np.ndarray, " places"]
+Margins = Float[Array, "margins *lanes"]
+
+#: The states and their rates at one end of a step.
+End = tuple[States, States]
+
+
 class Bracket(NamedTuple):
     """Bracket of the event in each lane: the step lengths `low` and `high` [s], with the margins there.
 
@@ -113,7 +121,7 @@ ON_MARGIN = 1e-10
 
 
 def missed_double_root(
-    function: Callable[[States], Lanes | None], side: Lanes, start: tuple[States, States], trial: Step, length: Lanes
+    function: Callable[[States], Lanes | None], side: Lanes, start: End, trial: Step, length: Lanes
 ) -> Lanes:
     """Fraction of a step at which a function may fall below zero and return; 2 if nowhere. This is the minimum of the
     cubic through values and derivatives at both ends, if the minimum is far below both values.
@@ -134,9 +142,7 @@ def missed_double_root(
     return jnp.where(dips, place, 2.0)
 
 
-def missed_loss(
-    places: Float[np.ndarray, " places"], margins: Float[Array, "places margins *lanes"] | None, free: Mask
-) -> Lanes:
+def missed_loss(places: Places, margins: Float[Array, "places margins *lanes"] | None, free: Mask) -> Lanes:
     """Fraction of a step at which a margin may first fall below zero and return; 2 if nowhere.
 
     This is the minimum of the parabola through the least known value and its neighbours, if the error may hide a zero.
@@ -169,9 +175,7 @@ def missed_loss(
     return jax.lax.cond(jnp.any(suspect), first_minimum, lambda: jnp.full(free.shape, 2.0))
 
 
-def cubic_minimum(
-    low: Float[Array, "..."], fall: Float[Array, "..."], high: Float[Array, "..."], rise: Float[Array, "..."]
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+def cubic_minimum(low: Lanes, fall: Lanes, high: Lanes, rise: Lanes) -> tuple[Lanes, Lanes]:
     """Position between 0 and 1 of the minimum of the cubic with given values and derivatives at both ends, and its
     value there.
 
@@ -185,11 +189,7 @@ def cubic_minimum(
     return jnp.where((fall < 0.0) & (rise > 0.0), place, 2.0), minimum
 
 
-def _least_minimum(
-    places: Float[np.ndarray, " places"],
-    values: list[Float[Array, "margins *lanes"]],
-    least_value: Float[Array, "margins *lanes"],
-) -> tuple[Float[Array, "margins *lanes"], Float[Array, "margins *lanes"]]:
+def _least_minimum(places: Places, values: list[Margins], least_value: Margins) -> tuple[Margins, Margins]:
     """Place and value of the minimum of the parabola through three neighbouring places: the place of the least value
     and its neighbours; if the least value is at an end of the step, the three places at that end. The place is 2 if the
     parabola has no minimum.
@@ -264,9 +264,7 @@ class Path(NamedTuple):
     bulge: States
 
     @classmethod
-    def of(
-        cls, time: Lanes, length: Lanes, start: tuple[States, States], middle: States, end: tuple[States, States]
-    ) -> "Path":
+    def of(cls, time: Lanes, length: Lanes, start: End, middle: States, end: End) -> "Path":
         """The motion with given states and rates at the ends, and a state in the middle."""
         (state, rate), (end_state, end_rate) = start, end
         step, slope, end_slope = end_state - state, length * rate, length * end_rate

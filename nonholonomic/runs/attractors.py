@@ -27,7 +27,7 @@ from ..validation import Bound, explaining, require_outside, require_whole, warn
 from .crossings import crossings
 from .event import UNMEASURED, modes_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, check_run, model_of, settings_for_lanes
-from .simulate import Samples
+from .simulate import Samples, Solved
 from .sweep import Options, require_names, table_of
 
 # Lyapunov exponents: whether nearby runs diverge exponentially, and how fast.
@@ -456,9 +456,7 @@ class Ranges(Samples):
         """These variables have no further dimensions."""
         return []
 
-    def solve(
-        self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
-    ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
+    def solve(self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings) -> Solved:
         """The `Status` of all cells, of which only the first `count` are run, and the variables of the table."""
         status, values = super().solve(cells, t1, size, count, settings)
         for name in self.names:

@@ -31,7 +31,7 @@ from ..text import shown
 from ..validation import explaining, require_outside, require_whole
 from .event import counted, modes_of, near_zero, problem_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
-from .simulate import Samples, mode_at, nan_where, own_axis
+from .simulate import Samples, Solved, mode_at, nan_where, own_axis
 from .sweep import Options, require_names, table_of
 
 #: A crossing within this fraction of the time in a mode before the end of the mode is at its end: the event function vanishes
@@ -132,7 +132,7 @@ def crossings_in_cells(
     size: int,
     count: int,
     after: bool,
-) -> tuple[Int[Array, " cells"], dict[str, Array]]:
+) -> Solved:
     """The `Status` of all cells, of which only the first `cells` are run, and the variables of the table."""
 
     def start(components: int) -> Kept:
@@ -231,9 +231,7 @@ class Crossings(Samples):
         time = Variable("s", np.float64, inner=("crossing",), long_name="time of the crossing")
         return {"time": time} | super().variables(model)
 
-    def solve(
-        self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
-    ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
+    def solve(self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings) -> Solved:
         """The `Status` of all cells, of which only the first `count` are run, and the variables of the table."""
         numbers = (jnp.asarray(t1, float), jnp.asarray(count), jnp.asarray(int(self.times[0]) - 1))
         status, values = crossings_in_cells(cells, self.names, *numbers, settings, size, len(self.times), self.after)

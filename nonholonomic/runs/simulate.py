@@ -33,6 +33,10 @@ from .trajectory import Trajectory
 DENSE = 1000
 
 
+#: The `Status` of runs, and the variables of their table.
+Solved = tuple[Int[Array, " cells"], dict[str, Array]]
+
+
 @dataclasses.dataclass(frozen=True)
 class Samples:
     """The samples in a table: the times [s], and the names of the quantities."""
@@ -62,9 +66,7 @@ class Samples:
         name, unit = self.along
         return [Axis(name, name, unit, self.times, name), *vectors]
 
-    def solve(
-        self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings
-    ) -> tuple[Int[Array, " cells"], dict[str, Array]]:
+    def solve(self, cells: AbstractModel, t1: float, size: int, count: int, settings: Settings) -> Solved:
         """The `Status` of all cells, of which only the first `count` are run, and the variables of the table."""
         names, times = self.names, jnp.asarray(self.times, float)
         horizon = (jnp.asarray(t1, float), jnp.asarray(count), settings)
@@ -157,7 +159,7 @@ def outcome_of(samples: SampledRun) -> HybridOutcome[Array]:
 @eqx.filter_jit
 def _read_samples(
     cells: AbstractModel, names: tuple[str, ...], times: Times, samples: SampledRun, tolerance: Float[Array, ""]
-) -> tuple[Int[Array, " cells"], dict[str, Array]]:
+) -> Solved:
     """The `Status` of runs of several modes, and the variables of the table."""
 
     def of_cell(model: AbstractModel, rows: Array, number: Array, end_time: Array) -> dict[str, Array]:

@@ -26,6 +26,9 @@ from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
 from ..runs.event import ROUND_OFF, UNMEASURED, near_zero
 from .form import Form, State
 
+#: The margins of a mode.
+Margins = Float[Array, "margins *cells"]
+
 #: A state at the start of a mode may be wrong by this many times the tolerance, because the mode before ended with an
 #: error. Slower changes of a margin than such errors allow say nothing of its direction.
 ACCUMULATED = 100.0
@@ -49,7 +52,7 @@ class ModeProblem(AbstractProblem):
     mode: "BatchedMode"
     states: Float[Array, "components *cells"]
     jump_times: Float[Array, "jumps *cells"] | None = None
-    allowances: Float[Array, "margins *cells"] | None = None
+    allowances: Margins | None = None
 
     @property
     def fits_one_kernel(self) -> bool:
@@ -114,15 +117,13 @@ class ModeProblem(AbstractProblem):
         is_near = jnp.abs(value) <= ACCUMULATED * error
         return value, slope, error, slope_error, is_near & (jnp.abs(slope) <= ACCUMULATED * slope_error)
 
-    def _falls_soon(
-        self, value: Float[Array, "margins *cells"], error: Float[Array, "margins *cells"], unit: Array
-    ) -> Bool[Array, "margins *cells"]:
+    def _falls_soon(self, value: Margins, error: Margins, unit: Array) -> Bool[Array, "margins *cells"]:
         """Whether each margin falls where it first changes by more than an error: the sign of its first derivative along the
         motion that is not zero. **Arguments:** `unit`: that of `SOON` [s]."""
         state, zero = self.states, jnp.zeros_like(self.states[0])
         rates, length = self.field(zero, state), jnp.min(jnp.where(jnp.isfinite(unit), unit, 1.0), axis=0)
 
-        def change(share: Float[Array, ""]) -> Float[Array, "margins *cells"]:
+        def change(share: Float[Array, ""]) -> Margins:
             def stage(carry: tuple[Array, Array], weights: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
                 rate, total = carry
                 rate = self.field(zero, state + share * length * weights[0] * rate)

@@ -24,8 +24,10 @@ from ..model.dynamics import Dynamics, Number, padded
 from ..model.input import Motion
 from .problem import LIMIT_RESERVE, Footprint, Obstacles, Pose, Problem, corners_of, frame_of
 
-#: Coefficients of the splines of the steering angle and of the front wheel's speed, all or those of an interval.
+#: Coefficients of the splines of the steering angle and of the front wheel's speed, all or those of an interval; and the
+#: unknowns of every knot.
 Splines: TypeAlias = Float[Array, "rows 2"]
+Unknowns: TypeAlias = Float[Array, "rows unknowns"]
 
 # Inverse dynamics: the force and the torque that move the stroller with a given speed and steering angle.
 #
@@ -336,9 +338,7 @@ Multipliers: TypeAlias = tuple[
 
 
 @eqx.filter_jit
-def _of_lane(
-    unknowns: Float[Array, "rows unknowns"], t1: Number, task: Task, multipliers: Multipliers, penalty: Number
-) -> Equations:
+def _of_lane(unknowns: Unknowns, t1: Number, task: Task, multipliers: Multipliers, penalty: Number) -> Equations:
     """The equations of a step from one candidate.
 
     The last of the unknowns is the logarithm of the factor of the duration; the speeds change inversely to it, so that the

@@ -18,13 +18,14 @@ from nonholonomic.geometry import Component, dot, multiply, scale, sum_vectors
 from nonholonomic.integration import ImplicitMidpoint, Settings, explicit_tableau, follow, sample
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import REACHED_END, require_adaptive, require_adjoint, require_times
+from nonholonomic.integration.samples import Times
 from nonholonomic.runs.model import AbstractModel
 from nonholonomic.runs.simulate import evenly_spaced, sampled_if_legal
 from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import Unit, as_text, distinguishing_labels
 
-from ..model.dynamics import Power, State, padded
+from ..model.dynamics import Number, Power, State, padded
 from ..model.input import Input
 from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, Scene
 
@@ -301,7 +302,7 @@ class Trajectory(AbstractRun):
     ```
     """
 
-    t: Float[Array, " times"]
+    t: Times
     values: dict[str, PyTree[Array]]
     stats: Stats
     spec: RideSpec
@@ -331,7 +332,7 @@ class Trajectory(AbstractRun):
         return self.model, float(self.spec.ride.t1)
 
     @property
-    def energy_residual(self) -> Float[Array, " times"]:
+    def energy_residual(self) -> Times:
         """Energy minus the initial energy and the work since the start [J]: zero for an exact solution."""
         return self.energy - self.energy[..., :1] - (self.work - self.work[..., :1])
 
@@ -474,9 +475,7 @@ class Trajectory(AbstractRun):
         return "\n".join(lines)
 
 
-def read_off(
-    spec: RideSpec, t: Float[Array, " times"], states: Float[Array, "components times"], stats: Stats
-) -> Trajectory:
+def read_off(spec: RideSpec, t: Times, states: Float[Array, "components times"], stats: Stats) -> Trajectory:
     """The trajectory of the given states at the given times."""
     model = spec.ride.model
     state = RideState(model.scene, model.input, t, states)
@@ -526,7 +525,7 @@ def ride(
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
-def _sampled(spec: RideSpec, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
+def _sampled(spec: RideSpec, times: Times, adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run at `times`; NaN and `finished` false if a traced number is out of range."""
     model, t1, settings, grid = spec.ride
     is_legal, _, samples = sampled_if_legal(model, times, t1, settings, grid, adjoint)
@@ -540,9 +539,7 @@ def _sampled(spec: RideSpec, times: Float[Array, " times"], adjoint: diffrax.Abs
     )
 
 
-def even_steps(
-    times: Float[Array, " times"], t1: Float[Array, ""], max_duration: Float[Array, ""], jumps: Array | None
-) -> Float[Array, " steps"]:
+def even_steps(times: Times, t1: Number, max_duration: Number, jumps: Array | None) -> Float[Array, " steps"]:
     """Times from 0 to `t1`, at most `max_duration` apart, that include all `times` and all known `jumps` of the input, and are
     evenly spaced between them.
 

@@ -32,6 +32,9 @@ from .rigid import RigidRolling, RigidSlipping
 #: The rates of states.
 Field = Callable[[States], States]
 
+#: Slip velocities at the stages of a step.
+Slips = Float[Array, "2 stages ..."]
+
 # The onset of a slip: an implicit step from a contact at rest to a slipping contact, of the length that the tolerance
 # allows.
 #
@@ -223,9 +226,7 @@ class _Contact(eqx.Module):
         inverse_mass = (c / determinant, -b / determinant, a / determinant)
         return cls(d, rise, inverse_mass, load_change, mu, N + load_change[0] * F1 + load_change[1] * F2, unit)
 
-    def correction(
-        self, duration: Float[Array, "..."], v: Float[Array, "2 stages ..."], missing: Float[Array, "2 stages ..."]
-    ) -> Float[Array, "2 stages ..."]:
+    def correction(self, duration: Number, v: Slips, missing: Slips) -> Slips:
         """Newton's correction of the slip velocities; only the slip's direction makes the equations stiff.
 
         With F = -mu N d along the arena and N = N0 - n . F, so that N = N0 / (1 - mu n . d), a turn of d by eta changes

@@ -201,9 +201,7 @@ def lifted(scene: Scene[Top], state: States, distance: ArrayLike, rate: ArrayLik
     return scene.body.mass * (potential + 0.5 * ((moment + rate) ** 2 - moment**2))
 
 
-def above_the_ground(
-    scene: Scene[Top], state: States, mode: Int[Array, " cells"]
-) -> tuple[Float[Array, "14 cells"], Lanes, Lanes]:
+def above_the_ground(scene: Scene[Top], state: States, mode: Int[Array, " cells"]) -> tuple[States, Lanes, Lanes]:
     """States of runs, in the layout for sliding on the top's own sphere; and the distance [m] of this sphere from the
     ground with its rate [m/s]. States of other modes refer to the foot below this sphere.
     """

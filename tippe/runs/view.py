@@ -393,9 +393,7 @@ def draw_launches(panels: list[Panel], angle: float, dots: str, unit: str = "rad
     return figure
 
 
-def theta_over_time(
-    scene: Scene, launch: Launch, times: Float[np.ndarray, " times"], tolerance: float, axes: Sequence[str]
-) -> Float[np.ndarray, " times"]:
+def theta_over_time(scene: Scene, launch: Launch, times: Values, tolerance: float, axes: Sequence[str]) -> Values:
     """theta [rad] of one launch at the given increasing times, also in flight. A program that has computed a table
     compiles nothing more for its plot, whereas `simulate` compiles fifty programs.
 
