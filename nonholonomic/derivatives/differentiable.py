@@ -222,9 +222,7 @@ class Request:
     kinds: tuple[ShapedArray, ...]
 
     @classmethod
-    def of_one(
-        cls, solve: AbstractSolve, parts: dict[int, Array | jax.ShapeDtypeStruct], leaves: Sequence[Array]
-    ) -> "Request":
+    def of_one(cls, solve: AbstractSolve, parts: dict[int, Array | jax.ShapeDtypeStruct], leaves: Leaves) -> "Request":
         """A request for a single cell. **Arguments:** `parts`: the wanted parts, for their shapes and dtypes."""
         kinds = tuple(ShapedArray(jnp.shape(part), part.dtype) for part in parts.values())
         return cls(solve, tuple(parts), 1, (False,) * len(leaves), kinds)
@@ -288,9 +286,7 @@ solve_cells.def_abstract_eval(
 )
 
 
-def _batched(
-    leaves: tuple[Array, ...], axes: Sequence[int | None], *, request: Request
-) -> tuple[list[Array], list[int]]:
+def _batched(leaves: Leaves, axes: Sequence[int | None], *, request: Request) -> tuple[list[Array], list[int]]:
     """Merge a batch of ensembles into one ensemble."""
     solve, cells, flags, kinds = request.solve, request.cells, request.batch_flags, request.kinds
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
@@ -398,9 +394,7 @@ def product(slope: Float[Array, "..."], tangent: Float[Array, "..."]) -> Float[A
     return terms.sum(axis=tuple(range(slope.ndim - jnp.ndim(tangent), slope.ndim)))
 
 
-def _pushed_forward(
-    tangents: LinearSolve, leaves: Sequence[Array], directions: Sequence[Array], primal: Primal
-) -> Primal:
+def _pushed_forward(tangents: LinearSolve, leaves: Leaves, directions: Sequence[Array], primal: Primal) -> Primal:
     """The tangents of a single cell's outputs: a tree like the primal, with `None` for outputs that have no derivative."""
     parts = flat(tangents.of.differentiable(primal))[0]
     present = {k: part for k, part in enumerate(parts) if part is not None}

@@ -49,6 +49,9 @@ from .samples import Built, Recorded, output_rows, reset_with_rows, sampled_roun
 #: of every cell, and the initial states.
 Build = Callable[[PyTree, Array, int], Built]
 
+#: A number of the modes, or several.
+Leaf = Float[Array, "... cells"]
+
 
 #: Up to this many numbers, those of a single run are always integrated forward: the run waits for its program, not for its
 #: steps, and the backward pass takes up to twice as long to compile.
@@ -214,14 +217,14 @@ class Kept(NamedTuple):
 
 def hybrid_samples_pulled_back(
     build: Callable[..., Built],
-    point: tuple[Float[Array, "... cells"], ...],
+    point: tuple[Leaf, ...],
     shown: Float[Array, "shown times cells"],
     end_time: Lanes,
     times: Float[Array, "times cells"],
     t1: Lanes,
     settings: Settings,
     counters: int,
-) -> list[Float[Array, "... cells"]]:
+) -> list[Leaf]:
     """The cotangents of the numbers of hybrid runs from those of their samples.
 
     **Arguments:**
@@ -281,7 +284,7 @@ def hybrid_samples_pulled_back(
         backward,
     ).adjoint
 
-    def numbers_and_start(*point: Float[Array, "... cells"]) -> PyTree:
+    def numbers_and_start(*point: Leaf) -> PyTree:
         modes, _, state = build(*point)
         numbers = [jax.tree.leaves(where_active(mode, rate)) for mode, rate in zip(modes, tangent[0][0], strict=True)]
         return jax.tree.map(lambda number: with_cells(number, cells), numbers), state
@@ -384,9 +387,7 @@ class Round(NamedTuple):
         state = self.modes[0].parts(runs.state)[0]
         return state[:-1], state[-1]
 
-    def mode(
-        self, group: Sequence[int]
-    ) -> tuple[list[Float[Array, "... cells"]], list[Array], Callable[..., AbstractBatchedMode]]:
+    def mode(self, group: Sequence[int]) -> tuple[list[Leaf], list[Array], Callable[..., AbstractBatchedMode]]:
         """The moving numbers of the modes, their rates, and the modes as a function of the numbers."""
         mode = mode_numbered(self.modes, group, self.kept.before.mode)
         (numbers, build), (rates,) = mode.active_numbers(), mode.directions()
@@ -403,9 +404,7 @@ class Round(NamedTuple):
         return [of_mode(number, sums) if number in group else sums for number, sums in enumerate(numbers)]
 
 
-def _gradients(
-    function: Callable[..., Lanes], point: tuple[Float[Array, "... cells"], ...]
-) -> list[Float[Array, "... cells"]]:
+def _gradients(function: Callable[..., Lanes], point: tuple[Leaf, ...]) -> list[Leaf]:
     """The derivatives of a value in every cell with respect to the cell's numbers."""
     try:
         value, pull = jax.vjp(function, *point)

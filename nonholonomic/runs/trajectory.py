@@ -266,13 +266,7 @@ def live_run(
         frame=lambda values, mode, rows, time: frame(at(drawn, values), time, rows, None if model.smooth else mode),
     )
     return LiveRun(
-        title,
-        sliders,
-        lambda values: jnp.all(at(model, values).legal()),
-        answer_of,
-        *answer,
-        moving,
-        summaries,
+        title, sliders, lambda values: jnp.all(at(model, values).legal()), answer_of, *answer, moving, summaries
     )
 
 

@@ -474,12 +474,12 @@ def chosen(quantities: dict[str, Quantity], names: Sequence[str]) -> dict[str, Q
     return {name: quantities[name] for name in quantities if name in kept}
 
 
+#: Name -> values.
+Series = dict[str, Values]
+
+
 def run_table(
-    quantities: dict[str, Quantity],
-    coords: dict[str, Values],
-    values: dict[str, Values],
-    axes: list[str],
-    request: dict[str, object],
+    quantities: dict[str, Quantity], coords: Series, values: Series, axes: list[str], request: dict[str, object]
 ) -> Table:
     """A table of quantities over time.
 

@@ -54,6 +54,9 @@ SCRIPTS = ("stage.js", "strips.js", "film.js", "player.js")
 #: The name of a run, or a list of one for each run; `None` for names that say what differs.
 Label = str | Sequence[str] | None
 
+#: Other runs or tables, which are shown with the first.
+Runs = Sequence[Any]
+
 
 class Page(NamedTuple):
     """A self-contained page as HTML. A notebook shows it."""
@@ -312,9 +315,7 @@ class Viewable:
         """Labels that tell runs of this kind apart, in units as for `plot`; for a single run the title of its picture."""
         return [""] if len(runs) == 1 else [f"run {k + 1}" for k in range(len(runs))]
 
-    def stages(
-        self, others: Sequence[Any] = (), overlaid: bool = False, unit: Unit = None, label: Label = None
-    ) -> list[Stage]:
+    def stages(self, others: Runs = (), overlaid: bool = False, unit: Unit = None, label: Label = None) -> list[Stage]:
         """This run and others as stages, one for each or a common one; arguments as for `view`."""
         runs, stages = [self, *others], []
         names = self.labels_of(runs, unit) if label is None else require_labels(label, runs)
@@ -329,7 +330,7 @@ class Viewable:
     def view(
         self,
         path: str | os.PathLike[str] | None = None,
-        others: Sequence[Any] = (),
+        others: Runs = (),
         overlaid: bool = False,
         unit: Unit = None,
         draw: Draw = None,
@@ -365,7 +366,7 @@ class Viewable:
         self,
         path: str | os.PathLike[str],
         times: Float[ArrayLike, " frames"] | Sequence[float] | None = None,
-        others: Sequence[Any] = (),
+        others: Runs = (),
         overlaid: bool = False,
         speed: float | None = None,
         fps: float = 25.0,
@@ -414,9 +415,7 @@ class Viewable:
         with replacing(file) as scratch:
             scratch.write_bytes(recorded(html_page, browser))
 
-    def _page(
-        self, others: Sequence[Any], overlaid: bool, unit: Unit, draw: Draw, label: Label, **options: Any
-    ) -> Page:
+    def _page(self, others: Runs, overlaid: bool, unit: Unit, draw: Draw, label: Label, **options: Any) -> Page:
         """The page in a unit, after a check of the unit and that the others are runs of the same package. **Arguments:**
         `options`: of `page`."""
         require_unit(unit)

@@ -39,7 +39,7 @@ from .impact import (
     still_parting,
     strike,
 )
-from .problems import STEM_COSINE, AbstractFlyingMode, InversionProblem, Quadratures, c_rate
+from .problems import STEM_COSINE, AbstractFlyingMode, InversionProblem, Quadratures, Started, c_rate
 
 #: The mode numbers. The last two are those of a top with a stem: the stem slides; or a sphere is about to strike, and
 #: the state is that of a flight.
@@ -450,9 +450,7 @@ def _at_other(
     return touches & ~rests & (rate_after < -closing), rests
 
 
-def airborne_modes(
-    scene: Scene[Top], problem: InversionProblem, last: bool, with_quadratures: bool = False
-) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
+def airborne_modes(scene: Scene[Top], problem: InversionProblem, last: bool, with_quadratures: bool = False) -> Started:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `hopping_modes`.
 
     If the stem would be in the arena at launch, the top starts on the stem: place and theta then refer to the stem's

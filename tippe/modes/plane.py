@@ -43,7 +43,7 @@ from .impact import (
     still_parting,
     strike,
 )
-from .problems import AbstractFlyingMode, InversionProblem, Quadratures
+from .problems import AbstractFlyingMode, InversionProblem, Quadratures, Started
 
 #: Most intervals between inflections that are searched for a landing; the search skips those where the top is too high.
 MOST_STRETCHES = 20_000
@@ -513,9 +513,7 @@ class Lean(AbstractFlyingMode):
         return Transition(number, state, zero, running, jnp.where(leaves_sphere, 0.0, jnp.inf), zeros)
 
 
-def hopping_modes(
-    scene: Scene[Top], problem: InversionProblem, last: bool, with_quadratures: bool = False
-) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
+def hopping_modes(scene: Scene[Top], problem: InversionProblem, last: bool, with_quadratures: bool = False) -> Started:
     """The modes of runs, sliding on each sphere and on both if there are two; and the index of the mode in which each
     starts.
 

@@ -1,10 +1,10 @@
 """Motion on one smooth contact, as problems for the integrator, and the base of the modes with flights."""
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.compilation.xla_cpu import compiled_setup, least
 from nonholonomic.geometry import Component, Tangent, Vector, cross, dot, rate_in_frame, scale, stacked, sum_vectors
@@ -52,6 +52,10 @@ def angle_of(scene: Scene, angle: Any) -> Float[Array, "..."]:
     return scene.body.stem_angle if isinstance(event, StemContact) else event
 
 
+#: The angle that ends a run [rad], the contact of the stem, or `None`: a reversal of the spin.
+Event: TypeAlias = Float[ArrayLike, "..."] | StemContact | None
+
+
 class InversionProblem(AbstractProblem):
     """Launches that end when theta reaches an angle or the contact is lost or jams.
 
@@ -70,9 +74,7 @@ class InversionProblem(AbstractProblem):
     flies: bool = eqx.field(static=True, default=False, kw_only=True)
 
     @classmethod
-    def of(
-        cls, scene: Scene[Top], launch: Launch, angle: Float[ArrayLike, "..."] | StemContact | None, cells: int
-    ) -> "InversionProblem":
+    def of(cls, scene: Scene[Top], launch: Launch, angle: Event, cells: int) -> "InversionProblem":
         """The problem of the given number of cells; the numbers of scene and launch are scalars or arrays with one
         number per cell. The frame is that of `Scene.turning_dynamics`, so final states do not contain directions.
         """
@@ -104,9 +106,7 @@ class InversionProblem(AbstractProblem):
 
 
 @compiled_setup
-def _inversion_problem(
-    scene: Scene[Top], launch: Launch, angle: Float[Array, "..."] | StemContact | None, cells: int
-) -> InversionProblem:
+def _inversion_problem(scene: Scene[Top], launch: Launch, angle: Event, cells: int) -> InversionProblem:
     states = scene.state(launch)
     shape = (states.shape[0], cells)
     states = jnp.broadcast_to(states.reshape(shape[0], -1), shape)
@@ -203,3 +203,7 @@ class AbstractFlyingMode(AbstractBatchedMode):
         if not self.with_quadratures:
             return problem
         return ExtendedProblem(problem, passive, state[size:], self.scales[size:])
+
+
+#: The modes of runs, and the index of the mode in which each starts.
+Started = tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]
