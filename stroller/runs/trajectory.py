@@ -18,7 +18,6 @@ from nonholonomic.geometry import Component, dot, multiply, scale, sum_vectors
 from nonholonomic.integration import ImplicitMidpoint, Settings, explicit_tableau, follow, sample
 from nonholonomic.integration.dense import all_crossings
 from nonholonomic.integration.problem import REACHED_END, require_adaptive, require_adjoint, require_times
-from nonholonomic.integration.samples import Times
 from nonholonomic.runs.model import AbstractModel
 from nonholonomic.runs.simulate import evenly_spaced, sampled_if_legal
 from nonholonomic.runs.trajectory import AbstractRun
@@ -28,6 +27,9 @@ from nonholonomic.text import Unit, as_text, distinguishing_labels
 from ..model.dynamics import Number, Power, State, padded
 from ..model.input import Input
 from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, Scene
+
+#: Times [s].
+Times = Float[Array, " times"]
 
 # The quantities of a ride, with units and names, as functions of its states, and the table of a run.
 
