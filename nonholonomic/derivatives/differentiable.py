@@ -31,6 +31,7 @@ Primal: TypeAlias = PyTree
 
 #: Numbers of a solve, each a scalar or an array.
 Leaves: TypeAlias = tuple[Float[Array, "..."], ...]
+Gradient = list[Float[Array, "cells ..."]]
 
 #: JAX's PyTreeDef, which type checkers take for a variable.
 Structure: TypeAlias = Any
@@ -93,9 +94,7 @@ class AbstractDifferentiableSolve(AbstractSolve):
         """The tangent of the primal along tangents of the active leaves, which may be the same for all cells."""
         raise NotImplementedError
 
-    def pull_back(
-        self, active: tuple[int, ...], cells: int, leaves: Leaves, cotangents: Primal
-    ) -> list[Float[Array, "cells ..."]]:
+    def pull_back(self, active: tuple[int, ...], cells: int, leaves: Leaves, cotangents: Primal) -> Gradient:
         """The cotangents of the active leaves in every cell, from those of the primal, `None` for parts without one."""
         raise NotImplementedError
 

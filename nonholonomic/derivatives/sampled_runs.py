@@ -16,7 +16,7 @@ from ..integration import AbstractProblem, CoreProblem, Outcome, Settings, State
 from ..integration.problem import LEFT_DOMAIN, event_time
 from ..validation import as_number
 from .adjoint import SampledCotangents, samples_pulled_back
-from .differentiable import AbstractDifferentiableSolve, Leaves, Structure, differentiable_solve
+from .differentiable import AbstractDifferentiableSolve, Gradient, Leaves, Structure, differentiable_solve
 from .variation import Tangent, Tangents, VariationalProblem, by_active, in_groups, probed, tangent_along, tangents_by
 
 # Samples of a run as a differentiable solve: its leaves, and how they are assembled into a problem.
@@ -207,6 +207,10 @@ class SampledRun(NamedTuple):
     counts: Float[Array, "*cells counters"] | None = None
 
 
+#: A sampled run, and its derivative along each tangent.
+Sampled = tuple[SampledRun, list[SampledRun]]
+
+
 def sampled_run(
     build: Build,
     modules: PyTree,
@@ -322,9 +326,7 @@ class BlockSampling(AbstractSampling):
         problem = super().built(modules, tolerance, cells)
         return core_problem(problem) if self.core_only else problem
 
-    def sampled(
-        self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool
-    ) -> tuple[SampledRun, list[SampledRun]]:
+    def sampled(self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool) -> Sampled:
         variational, (times, t1, settings, _) = VariationalProblem(built, tangents, False), options
         arguments = (variational, times, t1, jnp.asarray(built.start()[0].shape[1]), settings)
         samples = solve_with_samples(*arguments, n_blocks=1 + len(tangents), one_kernel=not nested)
@@ -336,9 +338,7 @@ class BlockSampling(AbstractSampling):
 
         return [(rates, built, built.start()[0])]
 
-    def pull_back(
-        self, active: tuple[int, ...], cells: int, leaves: Leaves, cotangents: SampledRun
-    ) -> list[Float[Array, "cells ..."]]:
+    def pull_back(self, active: tuple[int, ...], cells: int, leaves: Leaves, cotangents: SampledRun) -> Gradient:
         solve = dataclasses.replace(self, core_only=True) if cotangents.quadratures is None else self
         build, numbers, (times, t1, settings, _), _ = solve.builder(cells, leaves)
         rebuilt, point = by_active(build, active, numbers, cells)
@@ -361,7 +361,7 @@ class BlockSampling(AbstractSampling):
 
 def _with_slopes(
     variational: VariationalProblem, outcome: Outcome, samples: Float[Array, "*cells times components"]
-) -> tuple[SampledRun, list[SampledRun]]:
+) -> Sampled:
     """The samples and their derivative along each tangent, from the samples of states and variations."""
     states, *variations = jnp.split(samples, 1 + len(variational.tangents), axis=-1)
     time, status = outcome.end_time, outcome.status
@@ -391,9 +391,7 @@ class SingleSampling(AbstractSampling):
 
     in_blocks = False
 
-    def sampled(
-        self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool
-    ) -> tuple[SampledRun, list[SampledRun]]:
+    def sampled(self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool) -> Sampled:
         variational, (times, t1, settings, grid) = VariationalProblem(built, tangents, False), options
         outcome, states = sample(variational, times, t1, settings, grid=grid)
         samples, slopes = _with_slopes(variational, outcome, states.T)

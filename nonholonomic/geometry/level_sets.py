@@ -118,6 +118,10 @@ def newton_step(a: Component, b: Component, c: Component, x: Component, y: Compo
     return (c * x - b * y) * per_determinant, (a * y - b * x) * per_determinant
 
 
+#: Newton's step: two components, and the unit tangents for these components.
+Step = tuple[Component, Component, Vector, Vector]
+
+
 class Descent(NamedTuple):
     """The state of a search: a vector, its value, the longest step allowed next, whether the search has ended, and the number
     of iterations."""
@@ -130,7 +134,7 @@ class Descent(NamedTuple):
 
 
 def descended(
-    step: Callable[[Vector], tuple[Component, Component, Vector, Vector]],
+    step: Callable[[Vector], Step],
     onto: Callable[[Vector], Vector],
     value: Callable[[Vector], Component],
     start: Vector,
@@ -241,7 +245,7 @@ class AbstractLevel(AbstractGradientSurface):
         gap = self.offset(minimum)
         return BallGap(_lowered(minimum, gap, normal), normal, gap)
 
-    def _step_on_surface(self, position: Vector, foot: Vector) -> tuple[Component, Component, Vector, Vector]:
+    def _step_on_surface(self, position: Vector, foot: Vector) -> Step:
         """Newton's step from a foot towards the least squared distance to a position, and the two tangents at the foot
         for its components."""
         n = self.normal(foot)
@@ -250,9 +254,7 @@ class AbstractLevel(AbstractGradientSurface):
         aa, ab, bb = self.bending(foot, t1, t2)
         return *newton_step(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(away, t1), dot(away, t2)), t1, t2
 
-    def _step_on_ball(
-        self, centre: Vector, radius: Component, normal: Vector
-    ) -> tuple[Component, Component, Vector, Vector]:
+    def _step_on_ball(self, centre: Vector, radius: Component, normal: Vector) -> Step:
         """Newton's step from the point of a ball opposite to a normal towards the least value of the function, per unit
         gradient and radius, and the two tangents there for its components."""
         minimum, (t1, t2) = _lowered(centre, radius, normal), tangents(normal)

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ..compilation.components import over_cells
 from ..derivatives import SampledRun, tangents_of
 from ..derivatives.adjoint import SampledCotangents, mixture, samples_pulled_back, there_and_back
-from ..derivatives.sampled_runs import AbstractSampling, Options, solve_for_samples
+from ..derivatives.sampled_runs import AbstractSampling, Options, Sampled, solve_for_samples
 from ..derivatives.variation import Tangent, by_active, where_active, with_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, Settings, States
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
@@ -124,9 +124,7 @@ class HybridSampling(AbstractSampling):
     def built(self, modules: PyTree, tolerance: Array, cells: int | None) -> Built:
         return self.build(modules, tolerance, cells)
 
-    def sampled(
-        self, built: Built, tangents: tuple[Tangent, ...], options: Options, nested: bool
-    ) -> tuple[SampledRun, list[SampledRun]]:
+    def sampled(self, built: Built, tangents: tuple[Tangent, ...], options: Options, nested: bool) -> Sampled:
         if nested:
             raise ValueError("second derivatives do not exist through changes of mode; take differences of a gradient")
         tangents, settings = tuple((tangent[0], tangent[2]) for tangent in tangents), options[2]

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ..compilation.xla_cpu import written_in_place
 from .problem import FAILED, REACHED_END, RUNNING, AbstractProblem, Settings
 from .runge_kutta import AbstractTunedPair, Integers, Lanes, Mask, States, weighted_sum
-from .scheduler import InLanes, LaneScheduler, Outcome, Recorder
+from .scheduler import InLanes, LaneScheduler, Outcome, Recorder, Tried
 from .step import LaneState, after_step, trial_step, until_jump
 
 # The times at which the cells of a problem are sampled, and the samples so far.
@@ -108,9 +108,7 @@ class SampleRecorder(Recorder):
         accepted = jnp.ones(collected.sample.shape, bool)
         return Record(accepted, collected.sample, self.empty_rows(self.period, lane_state))
 
-    def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, PyTree]:
+    def step(self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]) -> Tried:
         arguments = (self.times, in_lanes, lane_state, record, iteration)
         return recorded_step(*arguments, lambda new_lanes, _, sample: Rows(new_lanes.state, sample))
 

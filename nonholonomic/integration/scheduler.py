@@ -77,6 +77,9 @@ class SchedulerState(NamedTuple):
 #: Problem, control and absolute tolerances of the cells in the lanes.
 InLanes = tuple[AbstractProblem, Control, States]
 
+#: The lanes after a step, and the record of it.
+Tried = tuple[LaneState, PyTree]
+
 
 #: What a period carries from step to step: the lanes, the record, the number of steps that idle lanes have missed since the
 #: last refill, and the number of steps.
@@ -101,9 +104,7 @@ class Recorder(eqx.Module):
         """Whether the record has room for another iteration of the period; otherwise the period ends."""
         return True if self.period is None else iteration < self.period
 
-    def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, PyTree]:
+    def step(self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]) -> Tried:
         """Try a step in every lane, and record it."""
         return try_step(*in_lanes, lane_state), None
 

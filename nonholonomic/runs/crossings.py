@@ -24,7 +24,7 @@ from ..hybrid import MOST_ROUNDS
 from ..hybrid.ensemble import after_reset, after_solve, all_rounds, at_start, time_left
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
-from ..integration.scheduler import InLanes, LaneScheduler, Recorder, of_cells
+from ..integration.scheduler import InLanes, LaneScheduler, Recorder, Tried, of_cells
 from ..integration.step import try_step
 from ..sweeps import Table, Variable
 from ..text import shown
@@ -78,9 +78,7 @@ class CrossingRecorder(Recorder):
         rows = jnp.zeros((self.period, len(state) + 1, *state.shape[1:]))
         return collected.counted[lane_state.cell], rows, jnp.full((self.period, *state.shape[1:]), self.count)
 
-    def step(
-        self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]
-    ) -> tuple[LaneState, PyTree]:
+    def step(self, in_lanes: InLanes, lane_state: LaneState, record: PyTree, iteration: Int[Array, ""]) -> Tried:
         (counted, rows, places), new = record, try_step(*in_lanes, lane_state)
         crosses = jnp.isfinite(new.crossing_time) & (new.crossing_time != lane_state.crossing_time)
         crosses &= new.crossing_time > self.leaves[lane_state.cell]

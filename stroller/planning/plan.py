@@ -30,6 +30,9 @@ from .problem import Box, Corners, Disc, Footprint, Goal, Limits, Problem, check
 from .search import INTERVALS, guess_of, paths_of, prices
 from .transcription import FINE, LIMIT_RESERVE, Candidates, Drive, Task, Tracker, drive_along, interpolate, optimise
 
+#: Batches of candidates, each with the length [m] of its shortest way.
+Guesses = Iterator[tuple[float, Candidates]]
+
 # The result of a plan.
 
 
@@ -367,9 +370,7 @@ def plan(
     return dataclasses.replace(best, candidates=jnp.asarray(fixed(scene.surface, padded(jnp.asarray(positions)))))
 
 
-def _guesses(
-    problem: Problem, starts: int, planner: Planner | None, seed: int, reasons: list[str]
-) -> Iterator[tuple[float, Candidates]]:
+def _guesses(problem: Problem, starts: int, planner: Planner | None, seed: int, reasons: list[str]) -> Guesses:
     """Batches of candidates, each with the length [m] of its shortest way: the proposal of a planner, then what searches
     find. Candidates that are in haste begin with the duration that their path allows, whatever the longest one is.
     `reasons` collects why batches cannot succeed."""
@@ -389,9 +390,7 @@ def _guesses(
         yield min(float(path.length.sum()) for path in paths), Candidates(np.stack(unknowns), np.array(durations))
 
 
-def _attempts(
-    problem: Problem, guesses: Iterator[tuple[float, Candidates]], tolerance: float, tried: list[np.ndarray]
-) -> Iterator[Plan]:
+def _attempts(problem: Problem, guesses: Guesses, tolerance: float, tried: list[np.ndarray]) -> Iterator[Plan]:
     """Optimised candidates that were driven, best first in each batch; `tried` collects the unknowns of all of them."""
     widths = [(name, high - low) for name, (low, high) in problem.limits.ranges().items()]
     for batch, (way, candidates) in enumerate(guesses):

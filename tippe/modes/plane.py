@@ -26,7 +26,7 @@ from nonholonomic.integration import AbstractProblem, Lanes, States
 from nonholonomic.integration.dense import halved
 from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 
-from ..model.body import Top
+from ..model.body import Number, Top
 from ..model.dynamics import COS_THETA, Dynamics, parts
 from ..model.scene import Scene
 from .impact import (
@@ -47,6 +47,10 @@ from .problems import AbstractFlyingMode, InversionProblem, Quadratures, Started
 
 #: Most intervals between inflections that are searched for a landing; the search skips those where the top is too high.
 MOST_STRETCHES = 20_000
+
+
+#: The passive quadratures.
+Passive = Float[Array, "7 ..."]
 
 
 class Cone(NamedTuple):
@@ -226,7 +230,7 @@ class Air(NamedTuple):
     flights: Int[Array, " cells"]
     open: Bool[Array, " cells"]
     log_rates: Lanes
-    quadratures: Float[Array, "7 cells"] | None = None
+    quadratures: Passive | None = None
 
 
 def take_flight(
@@ -318,9 +322,7 @@ def land(scene: Scene[Top], air: Air) -> Air:
     return after_impact._replace(open=after_impact.open & ~blow.fails)
 
 
-def quadratures_after(
-    body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."], time: Float[Array, "..."]
-) -> Float[Array, "7 ..."]:
+def quadratures_after(body: Top, free: FreeBody, quadratures: Passive, time: Number) -> Passive:
     """The passive quadratures after some time [s] in flight."""
     x, y, *c_vector, angle, work = quadratures
     u1, u2, _ = free.velocity
@@ -394,9 +396,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         contact_ball, _ = own_and_other(self.scene.body, self.number)
         return shown(self.scene.body, FreeBody.of(self.scene.body, contact_ball, state), state[OWN:])
 
-    def between(
-        self, motion: tuple[FreeBody, Float[Array, "7 times"]], passed: Float[Array, " times"]
-    ) -> Float[Array, "17 times"]:
+    def between(self, motion: tuple[FreeBody, Passive], passed: Float[Array, " times"]) -> Float[Array, "17 times"]:
         free, quadratures = motion
         free_after = flown(self.scene.body, self.scene.gravity, free, passed)
         return shown(self.scene.body, free_after, quadratures_after(self.scene.body, free, quadratures, passed))
@@ -473,7 +473,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
             )
         return air_after, select(air.open, select(has_landed, air_landed, air_after), air)
 
-    def motion_in(self, air: Air) -> tuple[FreeBody, Float[Array, "7 cells"] | None]:
+    def motion_in(self, air: Air) -> tuple[FreeBody, Passive | None]:
         return air.free, air.quadratures
 
     def closed(self, air: Air) -> Transition:
@@ -537,7 +537,7 @@ def _first_mode(body: Top, states: States) -> Int[Array, " cells"]:
     return (height(main, stem, states) < 0.0).astype(int)
 
 
-def shown(body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
+def shown(body: Top, free: FreeBody, quadratures: Passive) -> Float[Array, "17 ..."]:
     """The output rows of a body that may fly.
 
     **Arguments:** `quadratures`: position (x, y) of the centre of mass [m], the vector c of `problems.py`, spin
