@@ -12,7 +12,7 @@ from .device_code import solve_smooth_with_samples as solve_smooth_with_samples
 from .device_code import solve_smooth_with_tangents as solve_smooth_with_tangents
 from .gpu import CELLS_OF_KERNEL as CELLS_OF_KERNEL
 from .gpu import by_kernel as by_kernel
-from .gpu import gpu_for as gpu_for
+from .gpu import chosen_gpu as chosen_gpu
 from .gpu import place_of_jax as place_of_jax
 from .gpu import require_device as require_device
 from .motions import HybridRuns as HybridRuns

@@ -34,6 +34,9 @@ LOOPS = Path(__file__).with_name("loops.cu")
 #: With more lines than this in all stages of a step, stages stay loops.
 MOST_WRITTEN_OUT = 20_000
 
+#: Greatest number of characters of a program, which the compiler takes half a minute for.
+MOST_TEXT = 1_200_000
+
 #: Functions that are not part of a step are called, not written out, if they have more lines than this: tops that stick and
 #: fly compile in 5 instead of 54 s.
 MOST_OUTSIDE = 300
@@ -233,6 +236,8 @@ def kernel_of(recipe: Recipe) -> tuple[Kernel, Outcome | HybridOutcome]:
     lines = max(len(part.facts["stages"]) * _function("field", part).count("\n") for part in parts)
     large = "#define LARGE\n" if lines > MOST_WRITTEN_OUT else ""
     text = "\n".join([large + LOOPS.read_text(), *structs, _entry(values, results, run)])
+    if len(text) > MOST_TEXT:
+        raise ValueError(f"its program of {len(text):_} characters is too long for a kernel")
     samples = options.get("times", 0) * parts[0].facts.get("quantities", 0)
     return Kernel(text, results + samples), outcome
 

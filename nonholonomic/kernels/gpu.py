@@ -11,12 +11,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..compilation.cache import enable_compilation_cache, kept_files
+from ..compilation.cache import kept_files
 from ..compilation.xla_cpu import current_platform, on_cpu
 from ..text import shown
 from ..validation import warn
@@ -31,15 +33,22 @@ LEAST_CELLS = 4096
 #: Number of cells in a chunk of a table.
 CELLS_OF_KERNEL = 1 << 17
 
-#: Number of cells of the first launch of a kernel, and how long a launch may take [s]: a GPU that draws a screen stops longer
-#: ones, and Ctrl-C waits for the end of a launch.
-FIRST_LAUNCH, LONGEST = 16384, 0.5
+#: How long a launch should take [s]: a GPU that draws a screen stops much longer ones, and Ctrl-C waits for its end.
+#: No launch has fewer cells than run at once, so that a long run does not make all launches small.
+LONGEST = 0.5
+
+#: Greatest number of kernels that stay loaded.
+LOADED = 64
 
 OPTIONS = ("--std=c++17", "-diag-suppress=177,550")
 
 
 class KernelError(RuntimeError):
     """A kernel could not be compiled or run; the message says why."""
+
+
+#: The errors of kernels, of functions that cannot be written, of options that cannot be compared, and of NVIDIA's packages.
+ERRORS = (ValueError, TypeError, RuntimeError)
 
 
 def compiled(text: str, architecture: str) -> bytes:
@@ -55,7 +64,7 @@ def compiled(text: str, architecture: str) -> bytes:
     options = [option.encode() for option in (f"--gpu-architecture={architecture}", *OPTIONS)]
     (result,) = nvrtc.nvrtcCompileProgram(program, len(options), options)
     if result != nvrtc.nvrtcResult.NVRTC_SUCCESS:
-        log = b" " * _checked(nvrtc.nvrtcGetProgramLogSize(program))
+        log = b" " * (1 + _checked(nvrtc.nvrtcGetProgramLogSize(program)))
         nvrtc.nvrtcGetProgramLog(program, log)
         raise KernelError(f"the kernel does not compile: {log.decode(errors='replace').strip()[:300]}")
     code = b" " * _checked(nvrtc.nvrtcGetCUBINSize(program))
@@ -82,17 +91,16 @@ class Gpu:
         # JAX uses this context, too.
         self.context = _checked(driver.cuDevicePrimaryCtxRetain(self.device))
         kinds = driver.CUdevice_attribute
-        major, minor, self.processors = (
-            _checked(driver.cuDeviceGetAttribute(kind, self.device))
-            for kind in (
-                kinds.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR,
-                kinds.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR,
-                kinds.CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT,
-            )
-        )
+
+        def number(kind: Any) -> int:
+            return _checked(driver.cuDeviceGetAttribute(kind, self.device))
+
+        self.processors = number(kinds.CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)
+        major = number(kinds.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR)
+        minor = number(kinds.CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MINOR)
         self.architecture = f"sm_{major}{minor}"
-        # By the text of a kernel: its function, and the number of cells of its next launch.
-        self.functions: dict[str, Any] = {}
+        # By the text of a kernel: its module, its function, and the number of cells of its next launch.
+        self.loaded: dict[str, tuple[Any, Any]] = {}
         self.sizes: dict[str, int] = {}
 
     def __call__(
@@ -102,15 +110,14 @@ class Gpu:
         columns: Float[np.ndarray, "numbers cells"],
         count: int,
     ) -> Float[np.ndarray, "results cells"]:
-        driver, capacity = self.driver, columns.shape[1]
-        with self.lock:
-            _checked(driver.cuCtxSetCurrent(self.context))
+        driver, capacity, least = self.driver, columns.shape[1], 4 * BLOCK * self.processors
+        with self.lock, self.current():
             function = self.function(kernel.text)
             results = np.zeros((kernel.results, capacity))
             with self.copied(shared, columns, results, np.zeros(1, np.uint64)) as (*pointers, queue):
                 end = 0
                 while end < count:
-                    size, start = self.sizes.get(kernel.text, FIRST_LAUNCH), time.perf_counter()
+                    size, start = self.sizes.get(kernel.text, least), time.perf_counter()
                     begin, end = end, min(end + size, count)
                     first = np.array([begin], np.uint64)
                     _checked(driver.cuMemcpyHtoD(queue, first.ctypes.data, first.nbytes))
@@ -118,19 +125,34 @@ class Gpu:
                     blocks = min(-(-(end - begin) // BLOCK), BLOCKS * self.processors)
                     _checked(driver.cuLaunchKernel(function, blocks, 1, 1, BLOCK, 1, 1, 0, 0, arguments, 0))
                     _checked(driver.cuCtxSynchronize())
-                    share = 0.5 * LONGEST / (time.perf_counter() - start)
-                    self.sizes[kernel.text] = max(int((end - begin) * min(8.0, share)), BLOCK)
+                    if end - begin == size:
+                        share = 0.5 * LONGEST / (time.perf_counter() - start)
+                        self.sizes[kernel.text] = max(int(size * min(8.0, share)), least)
                 _checked(driver.cuMemcpyDtoH(results.ctypes.data, pointers[2], results.nbytes))
         return results
 
     def function(self, text: str) -> Any:
         """The function that runs cells, compiled once, and kept in the cache of compiled programs."""
-        if text not in self.functions:
-            facts = ("kernel", self.architecture, OPTIONS, text)
-            files = kept_files(enable_compilation_cache(), facts, lambda: {"code": compiled(text, self.architecture)})
+        if text not in self.loaded:
+            facts, options = ("kernel", self.architecture, OPTIONS, text), cast(Any, jax.config)
+            folder = options.jax_compilation_cache_dir
+            files = kept_files(
+                None if folder is None else Path(folder), facts, lambda: {"code": compiled(text, self.architecture)}
+            )
+            if len(self.loaded) == LOADED:
+                self.driver.cuModuleUnload(self.loaded.pop(next(iter(self.loaded)))[0])
             module = _checked(self.driver.cuModuleLoadData(np.frombuffer(files["code"], np.uint8).ctypes.data))
-            self.functions[text] = _checked(self.driver.cuModuleGetFunction(module, b"run_cells"))
-        return self.functions[text]
+            self.loaded[text] = module, _checked(self.driver.cuModuleGetFunction(module, b"run_cells"))
+        return self.loaded[text][1]
+
+    @contextmanager
+    def current(self) -> Iterator[None]:
+        """Make this the GPU of this thread."""
+        _checked(self.driver.cuCtxPushCurrent(self.context))
+        try:
+            yield
+        finally:
+            self.driver.cuCtxPopCurrent()
 
     @contextmanager
     def copied(self, *arrays: np.ndarray) -> Iterator[list[Any]]:
@@ -187,30 +209,40 @@ def require_device(device: object) -> None:
         raise ValueError(f"device = 'gpu': {why}; leave device out to run on the CPU")
 
 
-def gpu_for(cells: int, device: str | None) -> Gpu | None:
-    """The GPU that runs so many cells, `None` for the CPU. **Arguments:** `device`: "cpu", "gpu", or `None` for the faster."""
-    return first_gpu() if device == "gpu" or (device is None and cells >= LEAST_CELLS) else None
+def chosen_gpu(cells: int, device: str | None, try_it: Callable[[], object]) -> bool:
+    """Whether a table runs by kernels on the GPU, which is decided once for all its chunks.
 
-
-def place_of_jax(cells: int, device: str | None, has_kernel: bool = True) -> AbstractContextManager[None]:
-    """A context for JAX's part of a table: on the CPU if the table is small or a kernel runs it; otherwise, JAX's default.
-
-    **Arguments:** `has_kernel`: whether a kernel can run the cells; the others as for `gpu_for`.
+    **Arguments:** `cells`: number of cells; `device`: "cpu", "gpu", or `None` for the faster; `try_it`: compiles the kernel,
+    and raises an error if there is none.
     """
-    is_on_cpu = device == "cpu" or cells < LEAST_CELLS or (has_kernel and gpu_for(cells, device) is not None)
-    return on_cpu() if is_on_cpu else nullcontext()
+    if device == "cpu" or (device is None and cells < LEAST_CELLS) or first_gpu() is None:
+        return False
+    try:
+        try_it()
+    except ERRORS as error:
+        warn(f"this table runs by JAX's loops and not by a kernel on the GPU: {error}")
+        return False
+    return True
 
 
-def by_kernel(solve: Callable[[Gpu], Any], cells: int, device: str | None) -> Any:
+def place_of_jax(cells: int, device: str | None) -> AbstractContextManager[None]:
+    """A context for JAX's part of a table: on the CPU if it is small or a device was chosen; otherwise, JAX's default."""
+    return on_cpu() if device is not None or cells < LEAST_CELLS else nullcontext()
+
+
+def by_kernel(solve: Callable[[Gpu], Any], device: str | None, count: Any) -> Any:
     """The result of a solve by a kernel; `None` if it shall not run by one, or the kernel fails, which a warning then says.
 
-    **Arguments:** `solve`: function of the GPU; `cells`, `device`: as for `gpu_for`.
+    **Arguments:** `solve`: function of the GPU; `device`: "gpu" for a kernel; `count`: number of cells: with 0, the kernel is
+    only compiled, and errors are raised.
     """
-    gpu = gpu_for(cells, device)
+    gpu = first_gpu() if device == "gpu" else None
     if gpu is None:
         return None
     try:
         return solve(gpu)
-    except (KernelError, ValueError) as error:
-        warn(f"this table runs by JAX's loops and not by a kernel on the GPU: {error}")
+    except ERRORS as error:
+        if int(count) == 0:
+            raise
+        warn(f"some cells run by JAX's loops and not by a kernel on the GPU: {error}")
         return None

@@ -1,5 +1,5 @@
 // The loops of a run in one thread: over steps and stages, over rounds, and over the stretches of a transition. Everything else
-// is generated from Python (`device.py`) and follows this text: the equations, the coefficients of the Runge-Kutta pair, the
+// is generated from Python (`device_code.py`) and follows this text: the equations, the coefficients of the Runge-Kutta pair, the
 // first step, step-size control, the location of events, and what happens between the modes. The loops are those of
 // `integrator.js`. The same text compiles for the host, where it is a function that runs one cell after another.
 
@@ -36,6 +36,10 @@ DEVICE static double least(double a, double b) { return a < b || a != a ? a : b;
 DEVICE static double sign(double x) { return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : x; }
 DEVICE static bool is_finite(double x) { return fabs(x) < Infinity; }
 DEVICE static double logistic(double x) { return 1.0 / (1.0 + exp(-x)); }
+
+// A generated type `M` is one smooth motion: its functions, the sums and places of its stages, and the numbers of its
+// `components`, of its `stages` and of those that `look` at margins, of its `margins_count`, and of its `constants`. Its lists:
+// a start is the constants, then the lane, whose parts begin at `lane_status` and so on; `runs` is a `HybridOutcome`.
 
 // The margins, and the least of them and of the event function.
 template <class M>
@@ -138,14 +142,14 @@ DEVICE void run_motion(double* start, Record record) {
     double state[n], rate[n];
     UNROLLED for (int k = 0; k < n; k++) state[k] = lane[M::lane_state + k], rate[k] = lane[M::lane_rate + k];
     M::after(constants, lane, &length, tried, lane);
-    if (lane[M::lane_time] > from) record(constants, from, state, rate, lane[M::lane_time]);
+    if (lane[M::lane_time] > from) record(constants, from, state, rate, length, lane[M::lane_time]);
   }
   UNROLLED for (int k = 0; k < M::lane_size; k++) start[M::constants + k] = lane[k];
 }
 
 // In place of a function that keeps the accepted steps.
 struct NoRecord {
-  DEVICE void operator()(const double*, double, const double*, const double*, double) const {}
+  DEVICE void operator()(const double*, double, const double*, const double*, double, double) const {}
 };
 
 // Run a smooth problem from its start to its end.
@@ -164,10 +168,12 @@ DEVICE void run_sampled(const double* values, double* outcome, Samples samples) 
   M::begin(values, start);
   const double* const first = start + M::constants + M::lane_state;
   samples.write<M::quantities>(0.0, [=](double, double* row) { M::read(values, first, row); });
-  run_motion<M>(start, [&](const double* constants, double from, const double* state, const double* rate, double until) {
+  run_motion<M>(start, [&](const double* constants, double from, const double* state, const double* rate, double length,
+                           double until) {
     samples.write<M::quantities>(until, [=](double time, double* row) {
       double there[M::components];
-      within<M>(constants, from, state, rate, time - from, there);
+      // A step that ends on a jump does not pass it.
+      within<M>(constants, from, state, rate, least(time - from, length), there);
       M::read(values, there, row);
     });
   });

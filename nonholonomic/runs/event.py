@@ -325,12 +325,12 @@ class Ensemble(eqx.Module):
         device, options = "cpu" if traced else settings.device, {"nonterminal": self.continues}
         if self.problem is not None:
             arguments = (self.problem, jnp.asarray(t1), jnp.asarray(cells), settings)
-            outcome = by_kernel(lambda gpu: solve_smooth(*arguments, **options, run=gpu), self.capacity, device)
+            outcome = by_kernel(lambda gpu: solve_smooth(*arguments, **options, run=gpu), device, cells)
             solve = functools.partial(solve_ensemble, *arguments, one_kernel=True, traced=traced)
             return solve(**options)[0] if outcome is None else outcome
         solve = functools.partial(solve_hybrid, *self.start, t1, cells, settings, counters=self.counters, **options)
         by_gpu = functools.partial(solve_in_modes, *solve.args, **solve.keywords)
-        outcome = by_kernel(lambda gpu: by_gpu(run=gpu), self.capacity, device)
+        outcome = by_kernel(lambda gpu: by_gpu(run=gpu), device, cells)
         return solve(traced=traced) if outcome is None else outcome
 
     def solve_with_tangents(
@@ -355,9 +355,7 @@ class Ensemble(eqx.Module):
             options = {"nonterminal": self.continues}
             along = tuple(tangent.problem for tangent in tangents)
             arguments = (self.problem, along, jnp.asarray(t1), jnp.asarray(cells), settings)
-            solved = by_kernel(
-                lambda gpu: solve_smooth_with_tangents(*arguments, **options, run=gpu), self.capacity, device
-            )
+            solved = by_kernel(lambda gpu: solve_smooth_with_tangents(*arguments, **options, run=gpu), device, cells)
             if solved is None:
                 solved = solve_ensemble_with_tangents(*arguments, **options, one_kernel=one_kernel, traced=traced)
             return solved[0], solved[1], False
@@ -372,14 +370,9 @@ class Ensemble(eqx.Module):
         solve = functools.partial(
             solve_hybrid_with_tangents, modes, pairs, first, states, t1, cells, settings, **options
         )
-        solved = by_kernel(lambda gpu: solve(solve=functools.partial(solve_in_modes, run=gpu)), self.capacity, device)
+        solved = by_kernel(lambda gpu: solve(solve=functools.partial(solve_in_modes, run=gpu)), device, cells)
         run, sensitivities = solve() if solved is None else solved
         return run if outcome is None else outcome, sensitivities.slopes, sensitivities.grazing
-
-    @property
-    def capacity(self) -> int:
-        """Number of cells, padding included."""
-        return (self.problem.start()[0] if self.problem is not None else self.start[2]).shape[-1]
 
     @property
     def starts(self) -> Float[Array, "components cells"]:

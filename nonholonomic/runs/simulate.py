@@ -76,7 +76,7 @@ class Samples:
             def solve(gpu: Any) -> tuple[Outcome, dict[str, Array]]:
                 return solve_smooth_with_samples(problem, self.times, *horizon, run=gpu, read=read)
 
-            solved = by_kernel(solve, size, settings.device)
+            solved = by_kernel(solve, settings.device, count)
             if solved is None:
                 outcome, status, values = _followed(problem, cells, names, times, horizon)
             else:

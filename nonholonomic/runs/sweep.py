@@ -20,7 +20,7 @@ from .. import sweeps
 from ..compilation.xla_cpu import programs_in
 from ..integration import Settings
 from ..integration.problem import DEFAULT_MAX_STEPS, Status, require_times
-from ..kernels import CELLS_OF_KERNEL, gpu_for, place_of_jax, require_device
+from ..kernels import CELLS_OF_KERNEL, chosen_gpu, place_of_jax, require_device
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
 from ..sweeps.grid import EQUATIONS, FOR_A_TIME, REMARK, SHOWN_IN, columns
 from ..sweeps.table import cells_with
@@ -311,9 +311,17 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
     cells, is_scene = size_of(grid), isinstance(job.model, AbstractSceneModel)
     chunk = None if is_scene or cells <= 4 * LEAST_CHUNK else max(LEAST_CHUNK, chunk_for(cells))
-    has_kernel = job.has_kernel
-    if uses_kernel := has_kernel and gpu_for(cells, options.device) is not None:
-        chunk = min(CELLS_OF_KERNEL, 1 << (cells - 1).bit_length())
+    by_kernel = job._replace(settings=dataclasses.replace(job.settings, device="gpu"))
+    of_kernel = min(CELLS_OF_KERNEL, 1 << (cells - 1).bit_length())
+    uses_kernel = job.has_kernel and chosen_gpu(
+        cells, options.device, lambda: by_kernel(columns(grid, 0, of_kernel), 0)
+    )
+    if uses_kernel:
+        job, chunk = by_kernel, of_kernel
+    elif options.device == "gpu":
+        job = job._replace(settings=dataclasses.replace(job.settings, device="cpu"))
+        if not job.has_kernel:
+            warn("device = 'gpu': no kernel computes these samples, or runs by Diffrax; the table runs on the CPU")
     inner, most = [], None
     if job.samples is not None:
         request |= {"quantities": list(job.samples.names)}
@@ -322,7 +330,7 @@ def compute_table(job: TableJob, grid: list[Axis], request: dict[str, Any], opti
         numbers = (3 * len(job.samples.names) if uses_kernel else 12) * len(job.samples.times)
         most = max(16, 1 << (MOST_SAMPLED // numbers).bit_length() - 1)
     running = {"path": options.path, "progress": options.progress, "executor": options.executor}
-    with place_of_jax(cells, options.device, has_kernel):
+    with place_of_jax(cells, job.settings.device):
         table = sweeps.sweep(job, grid, variables, request, chunk=chunk, most=most, inner=inner, **running)
     illegal = cells_with(table, "status", Status.ILLEGAL.word)
     if len(illegal):

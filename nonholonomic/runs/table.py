@@ -97,7 +97,8 @@ class TableJob(NamedTuple):
     @property
     def has_kernel(self) -> bool:
         """Whether a kernel can run the cells."""
-        return self.samples is None or (self.samples.has_kernel and self.model.smooth)
+        has_samples = self.samples is None or (self.samples.has_kernel and self.model.smooth)
+        return has_samples and not self.by_diffrax
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -146,7 +147,7 @@ class TableJob(NamedTuple):
             job = self._replace(listed=())
             return job(dict(zip(numbers, values, strict=True)), count) | dict(zip(names, values, strict=True))
         size = next((len(values) for values in columns.values()), 1)
-        with place_of_jax(size, self.settings.device, self.has_kernel):
+        with place_of_jax(size, self.settings.device):
             return self._of_cells(columns, count)
 
     def _of_cells(self, columns: dict[str, Any], count: int) -> dict[str, Any]:

@@ -23,7 +23,18 @@ def compiled(text: str) -> ctypes.CDLL:
     """The library of a program."""
     folder = Path(tempfile.mkdtemp())
     (folder / "kernel.cpp").write_text(text)
-    command = [COMPILER, "-std=c++17", "-O1", "-w", "-shared", "-fPIC", "-o", "kernel.so", "kernel.cpp"]
+    command = [
+        COMPILER,
+        "-std=c++17",
+        "-O1",
+        "-march=native",
+        "-w",
+        "-shared",
+        "-fPIC",
+        "-o",
+        "kernel.so",
+        "kernel.cpp",
+    ]
     subprocess.run(command, cwd=folder, check=True)
     library = ctypes.CDLL(str(folder / "kernel.so"))
     shutil.rmtree(folder)

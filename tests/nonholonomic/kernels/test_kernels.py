@@ -14,7 +14,7 @@ from tops import rutstam_top
 import nonholonomic
 import stroller
 import tippe
-from nonholonomic.kernels import gpu
+from nonholonomic.kernels import device_code, gpu
 from nonholonomic.kernels.device_code import Kernel
 
 TOP = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
@@ -25,6 +25,13 @@ RIDER = stroller.Scene(
     friction=stroller.Damping(2.0, 1.0, 0.2, 0.05),
 )
 START = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+
+
+class Pulse(nonholonomic.AbstractMode):
+    """A pulse of 0.05 s, found by its comparisons of the time."""
+
+    def field(self, t, y):
+        return jnp.array([jnp.where((t > 1.0) & (t < 1.05), 10.0, 0.0)])
 
 
 def top(theta=(0.2, 0.5, 0.9), spin=155.0, t1=3.0, scene=TOP, **options):
@@ -53,6 +60,16 @@ TABLES = {
         progress=False,
         **device,
     ),
+    "times of a pulse": lambda **device: nonholonomic.sweep(
+        nonholonomic.Hybrid([Pulse()]),
+        [0.0],
+        2.0,
+        axes={"start[0]": [0.0, 1.0]},
+        times=[0.0, 1.0, 1.02, 1.05, 1.2, 2.0],
+        quantities=["y0"],
+        progress=False,
+        **device,
+    ),
     "times of a sleigh": lambda **device: of_case("mechanics", times=[0.5, 1.0, 2.0], quantities=["q2"], **device),
     "hops": lambda **device: top((1.4, 1.5, 1.55), 290.0, 0.4, HOPPING, **device),
     "rattleback": lambda **device: tippe.reversal_table(
@@ -77,6 +94,10 @@ NAMES = [*TABLES, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG)
 #: How far tables may differ, relative to the largest number of a variable: by round-off; and where runs with variations take
 #: other steps, which on the CPU are those of the table and in kernels are only those of the slopes.
 CLOSE, OF_OTHER_STEPS = 1e-9, 1e-7
+
+
+#: Tables of samples, on which the steps of the CPU end.
+SAMPLED = ("samples", "times of a sleigh", "times of a pulse")
 
 
 @pytest.fixture
@@ -116,8 +137,7 @@ def compare_with_the_cpu(name):
         if values.dtype.kind == "U" or variable in ("grazes", "hops", "switches", "sticks"):
             assert np.array_equal(table[variable], values), variable
         elif values.dtype.kind in "iu":
-            # Steps of the CPU end on samples.
-            if has_slopes or name in ("samples", "times of a sleigh"):
+            if has_slopes or name in SAMPLED:
                 continue
             # Where round-off decides, a step on the way to an event more or less.
             np.testing.assert_allclose(table[variable], values, atol=8, err_msg=variable)
@@ -127,7 +147,7 @@ def compare_with_the_cpu(name):
             assert np.all(np.where(np.isfinite(values), table[variable], 0.0) <= 1e-7), variable
         else:
             scale = np.max(np.abs(values[np.isfinite(values)]), initial=1e-3)
-            close = (OF_OTHER_STEPS if has_slopes or name in ("samples", "times of a sleigh") else CLOSE) * scale
+            close = (OF_OTHER_STEPS if has_slopes or name in SAMPLED else CLOSE) * scale
             assert np.array_equal(np.isnan(table[variable]), np.isnan(values))
             np.testing.assert_allclose(table[variable], values, rtol=0.0, atol=close, err_msg=variable)
 
@@ -171,6 +191,25 @@ def test_what_cannot_run_by_a_kernel_runs_by_the_loops_of_jax(monkeypatch):
     assert list(table.status) == ["completed", "completed"]
 
 
+def test_a_program_that_is_too_long_runs_by_the_loops_of_jax(monkeypatch):
+    monkeypatch.setattr(gpu, "first_gpu", lambda: run_on_host)
+    monkeypatch.setattr(device_code, "MOST_TEXT", 1000)
+    with pytest.warns(UserWarning, match=r"JAX's loops .* characters is too long"):
+        table = top(t1=0.25, crossing="last", device="gpu")
+    assert list(table.status) == ["not_inverted"] * 3
+
+
+def test_samples_without_a_kernel_say_so(on_host):
+    case = CASES["modes"]
+    axes = {case.parameter: [0.7, 0.8]}
+    with pytest.warns(UserWarning, match="no kernel computes these samples"):
+        table = nonholonomic.sweep(
+            case.system, case.start, 1.0, axes=axes, times=[0.5], quantities=["y0"], device="gpu", progress=False
+        )
+    assert not on_host
+    assert list(table.status) == ["completed", "completed"]
+
+
 def test_devices_are_checked(monkeypatch):
     with pytest.raises(ValueError, match="device = 'tpu' must be 'cpu', 'gpu'"):
         top(device="tpu")
@@ -199,14 +238,13 @@ def test_launches_cover_all_cells_in_slices(monkeypatch):
     """
     driver = FakeDriver()
     monkeypatch.setattr(gpu, "compiled", lambda text, architecture: text.encode())
-    monkeypatch.setattr(gpu, "enable_compilation_cache", lambda: None)
     device = gpu.Gpu(driver)
     assert (device.architecture, device.processors) == ("sm_90", 132)
     numbers = np.arange(40_000.0)[None]
     results = device(Kernel(text, 1), np.array([3.0]), numbers, 39_000)
     assert np.array_equal(results[0, :39_000], 3.0 * numbers[0, :39_000])
     assert not results[0, 39_000:].any()
-    assert driver.launches == [(8 * 132, 64)] * 2 or driver.launches[0] == (256, 64)
+    assert driver.launches == [(528, 64), (82, 64)]
     assert not driver.memory
     with pytest.raises(gpu.KernelError, match="CUDA_ERROR_OUT_OF_MEMORY"):
         device(Kernel(text, 1), np.array([3.0]), np.zeros((1, 1 << 20)), 1)
