@@ -19,7 +19,7 @@ from nonholonomic.compilation.cache import (
 from nonholonomic.compilation.xla_cpu import compile_quickly
 
 #: The tests that a plain `pytest` chooses (`pyproject.toml`).
-ORDINARY = "not slow"
+ORDINARY = "not slow and not gpu"
 
 
 def pytest_configure(config: pytest.Config) -> None:
