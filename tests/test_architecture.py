@@ -286,3 +286,11 @@ def test_no_module_beside_the_packages_has_the_name_of_an_installed_package():
     installed = importlib.metadata.packages_distributions().keys() | sys.stdlib_module_names | {"coverage", "numba"}
     assert {"interval_coverage", "browser"} <= modules
     assert not modules & installed
+
+
+def test_the_tests_that_compile_quickly_are_those_of_a_plain_run():
+    """`tests/conftest.py` compares the chosen marks with this expression."""
+    options = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]["addopts"]
+    ordinary = re.search(r'^ORDINARY = "(.*)"$', (ROOT / "tests" / "conftest.py").read_text(), re.MULTILINE)
+    assert ordinary
+    assert f"-m '{ordinary[1]}'" in options
