@@ -194,6 +194,8 @@ def test_what_cannot_run_by_a_kernel_runs_by_the_loops_of_jax(monkeypatch):
 def test_a_program_that_is_too_long_runs_by_the_loops_of_jax(monkeypatch):
     monkeypatch.setattr(gpu, "first_gpu", lambda: run_on_host)
     monkeypatch.setattr(device_code, "MOST_TEXT", 1000)
+    # Kernels of other tests are kept.
+    device_code.kernel_of.cache_clear()
     with pytest.warns(UserWarning, match=r"JAX's loops .* characters is too long"):
         table = top(t1=0.25, crossing="last", device="gpu")
     assert list(table.status) == ["not_inverted"] * 3
