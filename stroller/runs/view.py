@@ -318,7 +318,7 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
 class WheelAngles(AbstractPassive):
     """The rolling angles of the left, the right and the front wheel of a ride."""
 
-    def rates(self, problem: RideProblem, time: Float[Array, "..."], state: State, passive: State) -> State:
+    def rates(self, problem: RideProblem, time: Float[Array, "..."], state: State, passive: Array) -> Array:
         """Each rear wheel, half a track from the middle, rolls as fast as the ground passes below it."""
         length = problem.dynamics.body.wheelbase
         motion = problem.dynamics.geometry(state).motion

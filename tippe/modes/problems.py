@@ -135,7 +135,7 @@ class Quadratures(AbstractPassive):
 
     of_mass: bool = eqx.field(static=True, default=False)
 
-    def rates(self, problem: Any, time: Lanes, state: States, passive: States) -> States:
+    def rates(self, problem: Any, time: Lanes, state: States, passive: Array) -> Array:
         dynamics, (u, e, L, _) = problem.dynamics, parts(state)
         motion, (*path, c1, c2, c3, _, _) = dynamics.motion(state), passive
         c, frame_rate = (c1, c2, c3), (None, None) if self.of_mass else motion.frame_rate
