@@ -200,7 +200,7 @@ class Region(NamedTuple):
     start: Coordinates
 
     def points(self, count: int, seed: int) -> Float[np.ndarray, "count unknowns"]:
-        """Quasi-random points that fill the box; the first is the start.
+        """Quasi-random points that fill the box; the first is the start, and the second the middle, if that is another point.
 
         Source: Roberts, "The unreasonable effectiveness of quasirandom sequences" (2018): multiples of powers of the root of
         x^(d + 1) = x + 1 for d unknowns, here with a random shift. Importing SciPy's Sobol points takes seconds.
@@ -211,6 +211,8 @@ class Region(NamedTuple):
         unit = (shift + np.outer(np.arange(count), steps)) % 1.0
         points = self.middle + (2.0 * unit - 1.0) * self.half_width
         points[0] = np.clip(self.start, self.middle - self.half_width, self.middle + self.half_width)
+        if count > 1 and not np.allclose(points[0], self.middle):
+            points[1] = self.middle
         return points
 
     def log_density(self, points: Points) -> PerPoint:

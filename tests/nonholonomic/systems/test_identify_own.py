@@ -45,8 +45,7 @@ def test_candidates_that_come_to_rest_without_a_mode_for_rest_are_counted_and_pl
     )
     fall = np.sqrt(2.0 / GRAVITY)
     assert 0.31 > float(words.group(3)) > 0.3
-    # The last candidate below the limit, which lie 0.02 apart there.
-    assert 0.0 < (2.0 - fall) / (2.0 + fall) - float(words.group(4)) < 0.02
+    assert_close(float(words.group(4)), (2.0 - fall) / (2.0 + fall), atol=1e-2)
     restitution = 0.3 + 0.65 / (1.0 + np.exp(-fit.distribution.points[:, 0]))
     assert abs(int(words.group(1)) - np.sum(restitution < (2.0 - fall) / (2.0 + fall))) <= 2
 
