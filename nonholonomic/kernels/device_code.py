@@ -21,8 +21,8 @@ from ..text import is_array
 from .motions import HybridRuns, HybridStart, Part, SmoothRuns, size_of
 from .scalar_code import CUDA, scalar_code
 
-#: Runs some cells: text of a kernel; numbers that all cells share; those of each cell, (numbers, cells); how many cells to run;
-#: how many results a cell has. Returns the results, (results, cells).
+#: Runs the cells of a kernel, given the numbers that all cells share, those of each cell, (numbers, cells), and how many cells
+#: to run. Returns the results, (results, cells).
 Runner: TypeAlias = Callable[
     ["Kernel", Float[np.ndarray, " shared"], Float[np.ndarray, "numbers cells"], int],
     Float[np.ndarray, "results cells"],
@@ -31,15 +31,12 @@ Runner: TypeAlias = Callable[
 #: The loops, which precede every kernel.
 LOOPS = Path(__file__).with_name("loops.cu")
 
-#: With more lines than this in all stages of a step, stages stay loops.
-MOST_WRITTEN_OUT = 20_000
-
-#: Greatest number of characters of a program, which the compiler takes half a minute for.
+#: Greatest number of characters of a program: NVIDIA's compiler takes 24 s for a million.
 MOST_TEXT = 1_200_000
 
-#: Functions that are not part of a step are called, not written out, if they have more lines than this: tops that stick and
-#: fly compile in 5 instead of 54 s.
-MOST_OUTSIDE = 300
+#: Functions with more lines than the first number are called, not written out. For those that are not part of a step, and so
+#: run seldom, it is the second one.
+MOST_IN_STEPS, MOST_OUTSIDE = 1500, 300
 IN_STEPS = ("length", "field", "margins", "crossing", "after")
 
 
@@ -83,6 +80,10 @@ class Recipe:
         """The arguments of a solve from their arrays."""
         return eqx.combine(values, jax.tree.unflatten(self.structure[0], self.static))
 
+    def read(self, values: PyTree, state: Float[Array, "components 1"]) -> PyTree:
+        """What `solve_smooth_with_samples` samples, from the arrays of its arguments and a state."""
+        return self.arguments(values)[3](state)
+
 
 def solve_smooth(
     problem: AbstractProblem,
@@ -118,9 +119,8 @@ def solve_smooth_with_samples(
     cells, arguments = problem.start()[0].shape[1], (problem, jnp.asarray(t1), settings, read)
     options = {"passes": False, "n_blocks": 1, "times": len(times)}
     outcome, rows = _solved(arguments, cells, int(count), run, options, times)
-    recipe = Recipe.of(arguments, options)
-    state = jax.ShapeDtypeStruct((len(problem.start()[0]), 1), jnp.result_type(float))
-    kinds = eqx.filter_eval_shape(lambda values, state: recipe.arguments(values)[3](state), recipe.values, state)
+    recipe, state = Recipe.of(arguments, options), jax.ShapeDtypeStruct((len(outcome.state), 1), outcome.state.dtype)
+    kinds = eqx.filter_eval_shape(recipe.read, recipe.values, state)
     leaves, structure = jax.tree.flatten(kinds)
     parts = np.split(rows.reshape(len(times), -1, cells), np.cumsum(list(map(size_of, leaves)))[:-1], axis=1)
     samples = [
@@ -219,26 +219,22 @@ def kernel_of(recipe: Recipe) -> tuple[Kernel, Outcome | HybridOutcome]:
         advance = ["DEVICE static void advance(const double* values, double* runs) {", *cases, "}"]
         facts = {name: rounds.facts[name] for name in ("rounds", "running", "unresolved")} | offsets
         structs.append(_struct_of("Rounds", facts, [_function("first", rounds), "\n".join(advance)]))
-        run, parts = "run_rounds<Rounds>(values, outcome);", kinds
+        run, samples = "run_rounds<Rounds>(values, outcome);", 0
     else:
-        times = options.get("times", 0)
-        read = (lambda values, state: recipe.arguments(values)[3](state)) if times else None
-        start = lambda values: recipe.arguments(values)[:3]  # noqa: E731
-        part = SmoothRuns(start, options["passes"], options["n_blocks"], read).part(values)
+        times = options.pop("times", 0)
+        options["read"] = recipe.read if times else None
+        part = SmoothRuns(lambda values: recipe.arguments(values)[:3], **options).part(values)
         outcome = eqx.filter_eval_shape(part.functions["ended"][0], *part.functions["ended"][1])
-        structs, parts = [_struct("Motion", part, {})], [part]
-        run, results = "run_smooth<Motion>(values, outcome);", size_of(outcome)
+        structs = [_struct("Motion", part, {})]
+        run, samples = "run_smooth<Motion>(values, outcome);", times * part.facts.get("quantities", 0)
         if times:
             shared = sum(leaf.shape == () for leaf in jax.tree.leaves(values))
-            samples = f"{{shared + {shared}, {times}, 0, results + {results} * capacity + cell, capacity}}"
-            run = f"run_sampled<Motion>(values, outcome, {samples});"
+            place = f"{{shared + {shared}, {times}, 0, results + {size_of(outcome)} * capacity + cell, capacity}}"
+            run = f"run_sampled<Motion>(values, outcome, {place});"
     results = size_of(outcome)
-    lines = max(len(part.facts["stages"]) * _function("field", part).count("\n") for part in parts)
-    large = "#define LARGE\n" if lines > MOST_WRITTEN_OUT else ""
-    text = "\n".join([large + LOOPS.read_text(), *structs, _entry(values, results, run)])
+    text = "\n".join([LOOPS.read_text(), *structs, _entry(values, results, run)])
     if len(text) > MOST_TEXT:
         raise ValueError(f"its program of {len(text):_} characters is too long for a kernel")
-    samples = options.get("times", 0) * parts[0].facts.get("quantities", 0)
     return Kernel(text, results + samples), outcome
 
 
@@ -246,7 +242,7 @@ def _function(name: str, part: Part) -> str:
     """The text of a function of a part."""
     function, examples = part.functions[name]
     text = scalar_code(CUDA, name, function, *examples)
-    is_called = name not in IN_STEPS and text.count("\n") > MOST_OUTSIDE
+    is_called = text.count("\n") > (MOST_IN_STEPS if name in IN_STEPS else MOST_OUTSIDE)
     return text.replace("DEVICE", "CALLED", 1) if is_called else text
 
 
@@ -267,20 +263,17 @@ def _struct(name: str, part: Part, more: dict[str, int]) -> str:
     numbers |= {"stages": stages, "looks": len(facts["looks"]), "has_event": crossing is not None}
     numbers |= {name: facts.get(name, 0) for name in ("most_hops", "stretch", "quantities")} | more
     # After the stages come the end of the step, its error and its middle.
-    sums = [*facts["stages"], facts["step"], facts["error"], facts["middle"]]
+    sums = [
+        " + ".join(f"{weight!r} * rates[{stage}][k]" for stage, weight in enumerate(weights) if weight != 0.0) or "0.0"
+        for weights in (*facts["stages"], facts["step"], facts["error"], facts["middle"])
+    ]
     looks = [facts["looks"].index(k) + 1 if k in facts["looks"] else 0 for k in range(stages)]
     tables = [
-        _by_stage("double", "sum", f"const double (*rates)[{numbers['components']}], int k", map(_sum, sums)),
+        _by_stage("double", "sum", f"const double (*rates)[{numbers['components']}], int k", sums),
         _by_stage("constexpr double", "place", "", map(repr, facts["places"])),
         _by_stage("constexpr int", "look", "", map(str, looks)),
     ]
     return _struct_of(name, numbers, [*tables, *(_function(function, part) for function in part.functions)])
-
-
-def _sum(weights: list[float]) -> str:
-    """The sum of the rates with some weights."""
-    terms = [f"{weight!r} * rates[{stage}][k]" for stage, weight in enumerate(weights) if weight != 0.0]
-    return " + ".join(terms) or "0.0"
 
 
 def _by_stage(result: str, name: str, arguments: str, texts: Iterable[str]) -> str:

@@ -27,7 +27,7 @@ from .device_code import Kernel
 #: Number of threads in a block, and greatest number of blocks for each processor, of which four run at once.
 BLOCK, BLOCKS = 64, 8
 
-#: With fewer cells than this, a CPU is faster: a kernel lasts as long as the longest run, about 20 ms for a table on the plane.
+#: Tables with fewer cells than this run on the CPU: a kernel lasts as long as its longest run. An estimate, not measured.
 LEAST_CELLS = 4096
 
 #: Number of cells in a chunk of a table.
@@ -182,9 +182,7 @@ def first_gpu() -> Gpu | None:
     is_default = current_platform() == "gpu"
     if importlib.util.find_spec("cuda") is None or importlib.util.find_spec("cuda.bindings") is None:
         if is_default:
-            warn(
-                "large tables take a GPU some fifty times as long without its kernels: pip install 'nonholonomic[gpu]'"
-            )
+            warn("large tables run by JAX's loops, and not by kernels on the GPU: pip install 'nonholonomic[gpu]'")
         return None
     from cuda.bindings import driver  # pyright: ignore[reportMissingImports]
 

@@ -4,14 +4,9 @@
 // `integrator.js`. The same text compiles for the host, where it is a function that runs one cell after another.
 
 #ifdef __CUDACC_RTC__
-// What a step calls is written out, unless it is large; what happens between steps is called, if it is.
-#ifdef LARGE
-#define DEVICE __device__
-#define UNROLLED _Pragma("unroll 1")
-#else
+// Functions are written out where they are used, or called if they are large.
 #define DEVICE __device__ __forceinline__
 #define UNROLLED _Pragma("unroll")
-#endif
 #define CALLED __device__ __noinline__
 #define KERNEL extern "C" __global__ void __launch_bounds__(64)
 #define NaN __longlong_as_double(0x7ff8000000000000LL)

@@ -355,9 +355,9 @@ class _Block(AbstractScalarReader):
         """Values with updates added at indices, which are known."""
         sums, nothing = values, np.zeros(values.shape)
         for place in np.ndindex(updates.shape):
-            one = np.zeros(updates.shape)
-            one[place] = 1.0
-            places = equation.primitive.bind(nothing, indices.astype(int), one, **equation.params)
+            unit = np.zeros(updates.shape)
+            unit[place] = 1.0
+            places = equation.primitive.bind(nothing, indices.astype(int), unit, **equation.params)
             # Where the update is added, the sum; elsewhere, the value.
             added = self.each("add", sums, np.full(sums.shape, updates[place], object))
             sums = np.where(np.asarray(places) != 0.0, added, sums)

@@ -201,6 +201,18 @@ def test_a_program_that_is_too_long_runs_by_the_loops_of_jax(monkeypatch):
     assert list(table.status) == ["not_inverted"] * 3
 
 
+@needs_compiler
+def test_large_functions_are_called(on_host, monkeypatch):
+    monkeypatch.setattr(device_code, "MOST_IN_STEPS", 10)
+    # Kernels of other tests are kept.
+    device_code.kernel_of.cache_clear()
+    compare_with_the_cpu("times of a sleigh")
+    assert all("CALLED static void field" in text for text in on_host)
+    for text in dict.fromkeys(on_host) if importlib.util.find_spec("cuda") is not None else ():
+        assert gpu.compiled(text, "sm_90").startswith(b"\x7fELF")
+    device_code.kernel_of.cache_clear()
+
+
 def test_samples_without_a_kernel_say_so(on_host):
     case = CASES["modes"]
     axes = {case.parameter: [0.7, 0.8]}
