@@ -58,7 +58,7 @@ def compiled(text: str, architecture: str) -> bytes:
 
     **Raises:** `KernelError` with what the compiler says.
     """
-    from cuda.bindings import nvrtc  # pyright: ignore[reportMissingImports]
+    from cuda.bindings import nvrtc  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
 
     program = _checked(nvrtc.nvrtcCreateProgram(text.encode(), b"kernel.cu", 0, [], []))
     options = [option.encode() for option in (f"--gpu-architecture={architecture}", *OPTIONS)]
@@ -184,7 +184,7 @@ def first_gpu() -> Gpu | None:
         if is_default:
             warn("large tables run by JAX's loops, and not by kernels on the GPU: pip install 'nonholonomic[gpu]'")
         return None
-    from cuda.bindings import driver  # pyright: ignore[reportMissingImports]
+    from cuda.bindings import driver  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
 
     try:
         return Gpu(driver)
