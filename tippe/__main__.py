@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 #: The arenas, which name the files of the tables.
 ARENAS = ("plane", "cylinder")
 
-#: Times at which theta is drawn, close enough to show nutation, and duration of the displayed run [s].
+#: Times at which theta is drawn, close enough to show nutation, and the longest time of the picture [s].
 SAMPLES, SHOWN = 2048, 5.0
 
 #: The page's title, and the placeholder for the contents below the top.
@@ -115,7 +115,8 @@ def described(options: argparse.Namespace) -> list[str]:
         f"I1 / I3 = {float(gamma):.3f} lies {'' if steady.group(top) == 'II' else 'not '}between 1 - a / R = "
         f"{1.0 - float(alpha):.3f} and 1 + a / R = {1.0 + float(alpha):.3f}, so it can "
         f"{'' if steady.group(top) == 'II' else 'not '}turn over.",
-        f"Spun at {options.rpm:g} rpm ({spin:.4g} rad/s), inclined by theta(0); Coulomb friction mu.",
+        f"Spun at {options.rpm:g} rpm ({spin:.4g} rad/s), inclined by theta(0).",
+        f"Coulomb friction mu falls to zero below a slip speed of {options.slip_speed:g} m/s.",
     ]
 
 
@@ -160,9 +161,8 @@ def launch_shown(options: argparse.Namespace) -> Launch:
 def sliders(options: argparse.Namespace) -> str:
     """The page of the top with sliders, with a placeholder for the contents below."""
     model = TopModel(scene=scene(options, "plane"), launch=launch_shown(options))
-    t1 = min(SHOWN, options.t1)
-    live = page_of_launch(model, None, t1)._replace(title=TITLE)
-    return live_page(live, stage_at_start(model, t1), 0.2, BELOW, ("deg", "rpm")).html
+    live = page_of_launch(model, None, options.t1)._replace(title=TITLE)
+    return live_page(live, stage_at_start(model, options.t1), 0.2, BELOW, ("deg", "rpm")).html
 
 
 def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], list[Path], str]:

@@ -219,6 +219,7 @@ def live_run(
     named: Mapping[Status, Status] | None = None,
     result: Callable[[Any, HybridOutcome, Array], Array] | None = None,
     motion: Callable[[Any], AbstractProblem] | None = None,
+    afterwards: Callable[..., Array] | None = None,
 ) -> LiveRun:
     """The contents of a page of any model.
 
@@ -232,6 +233,7 @@ def live_run(
     - `result`: function of the model, the outcome and the integer of its `Status` that returns the result, or infinity; by
       default the time of the event.
     - `motion`: function that returns the problem of a smooth drawn run; by default that of the model.
+    - `afterwards`: function of the drawn model and its outcome that returns an index of the `afterwards` of the `LiveRun`.
     """
     settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
 
@@ -263,6 +265,7 @@ def live_run(
         lambda values: start(at(drawn, values), None, motion),
         *options,
         False,
+        outcome=afterwards and (lambda values, ended: afterwards(at(drawn, values), ended)),
         frame=lambda values, mode, rows, time: frame(at(drawn, values), time, rows, None if model.smooth else mode),
     )
     return LiveRun(

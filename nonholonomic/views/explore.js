@@ -53,13 +53,13 @@
     };
   }
 
-  // The word for the end of a run until the answer; the whole run of a top may end upright again.
-  function wordOf([status], run) {
-    const word = (words[status] || "illegal").replace(/_/g, " "), angle = run.curves[0].values;
-    return word === "inverted" && angle[angle.length - 1] < Math.PI / 2 ? "inverted, but fell back" : word;
+  // The word for the end of a run until the answer, and what the whole run has done after that: a top may fall back.
+  function wordsOf([status, found]) {
+    const after = Number.isFinite(found) && facts.afterwards.length ? facts.afterwards[moves.read("outcome", values)[0]] : "";
+    return [(words[status] || "illegal").replace(/_/g, " "), after].filter(Boolean);
   }
   function tell(outcome, run, took) {
-    const found = outcome[1], word = wordOf(outcome, run);
+    const found = outcome[1], word = wordsOf(outcome).join(", but ");
     result.replaceChildren();
     element("span", result, { textContent: facts.answer.label });
     element("strong", result, { textContent: Number.isFinite(found) ? `${digits(found)} ${facts.answer.unit}` : word });
@@ -88,8 +88,8 @@
     }
     asks.run(values);
     const outcome = asks.read("outcome", values), took = performance.now() - began;
-    const run = recorded(most), [first, ...rest] = wordOf(outcome, run).split(", but");
-    const marked = [`${first === "inverted" ? "turned over" : first} at ${digits(outcome[1], 3)} s`, ...rest].join(",");
+    const run = recorded(most), [first, ...rest] = wordsOf(outcome);
+    const marked = [`${first === "inverted" ? "turned over" : first} at ${digits(outcome[1], 3)} s`, ...rest].join(", ");
     // The answer may be another quantity than a time.
     run.marks = facts.answer.unit === "s" && Number.isFinite(outcome[1]) ? [[outcome[1], marked]] : [];
     tell(outcome, run, took);
@@ -120,12 +120,15 @@
     // The address of a page inside another page may not be changeable.
     try { history.replaceState(null, "", `#${address}`); } catch (error) { /* The run then has no link. */ }
   }
+  // The end of a parameter's name is enough if only one slider's ends so.
   function fromAddress() {
-    const named = new URLSearchParams(location.hash.slice(1));
-    return sliders.map((slider) => {
-      const value = named.has(slider.name) ? Number(named.get(slider.name)) : NaN;
-      return Number.isFinite(value) ? value : slider.value;
-    });
+    const wanted = [...initial];
+    for (const [name, text] of new URLSearchParams(location.hash.slice(1))) {
+      const alike = sliders.filter(({ path }) => `.${path}`.endsWith(`.${name}`));
+      const slider = sliders.find((one) => one.name === name) || (alike.length === 1 && alike[0]);
+      if (slider && text && Number.isFinite(Number(text))) wanted[sliders.indexOf(slider)] = Number(text);
+    }
+    return wanted;
   }
 
   const map = makeMap(document.getElementById("map"), window.live, integrator, (wanted) => set(wanted));

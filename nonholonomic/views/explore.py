@@ -52,7 +52,7 @@ class Simulator(NamedTuple):
     - `t1`: horizon [s]; `settings`: settings with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of
       `Transition.counts`; `passes`: whether a run continues through its event.
     - `outcome`: function of the sliders' numbers and the `HybridOutcome` that returns the `Status` of the run, and the
-      result, or infinity. `None` if no result is needed.
+      result, or infinity; of a drawn run, what it did after its event. `None` if neither is needed.
     - `frame`: function that returns the frame at any time; its arguments are the sliders' numbers, the index of the
       mode or -1 between modes, the output rows of the modes, and the time [s]. `None` if no path is needed.
     """
@@ -128,6 +128,7 @@ class LiveRun(NamedTuple):
     - `motion`: the simulator of the drawn run, with its `frame`.
     - `summaries`: indices of the curves of the `Show` whose values at the start and the end of the run the page also shows as
       numbers, beside the result.
+    - `afterwards`: what a run may do after its event, of which the `outcome` of `motion`, if it has one, returns the index.
     """
 
     title: str
@@ -138,6 +139,7 @@ class LiveRun(NamedTuple):
     unit: str
     motion: Simulator
     summaries: tuple[int, ...]
+    afterwards: tuple[str, ...] = ()
 
 
 def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "", unit: Unit = None) -> Page:
@@ -165,6 +167,7 @@ def programs(live: LiveRun) -> str:
         "words": {int(status): status.word for status in Status},
         "answer": {"label": live.label, "unit": live.unit},
         "summaries": live.summaries,
+        "afterwards": live.afterwards,
     }
     parts = {
         "facts": json.dumps(facts),

@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
@@ -11,8 +12,11 @@ from hop_reference import CASES, follow
 from stems import first_contact
 
 import tippe
+from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.sweeps import Table
-from tippe.runs.view import motion
+from tippe.runs.model import TopModel
+from tippe.runs.observables import AFTERWARDS
+from tippe.runs.view import motion, page_of_launch
 
 LAUNCH, T1, TOLERANCE = tippe.Launch.degrees(theta=6, rpm=1500), 5.0, 1e-10
 
@@ -53,13 +57,25 @@ def test_the_stem_carries_the_top_from_its_first_contact(run):
     assert "turned over: the stem first carries it at 3.01687 s\n" in str(run)
     falls_back = run.t[(run.t > run.stem_time) & (run.contact == 0)][-1]
     fallen = run.at([0.0, falls_back])
-    assert "carries it at 3.01687 s, and at the end its sphere touches again\n" in str(fallen)
+    assert "carries it at 3.01687 s, but its sphere touches again\n" in str(fallen)
     assert_close(run.at([run.stem_time]).theta[0], first_contact(run.scene.body), atol=1e-8)
     scan = run.at(np.linspace(run.stem_time - 1e-3, run.stem_time + 1e-3, 2001))
     on_stem = (np.asarray(scan.contact) == 1) & (np.asarray(scan.normal_force) > 0.0)
     assert 0.0 <= scan.t[np.argmax(on_stem)] - run.stem_time <= 1.01e-6
     # Before, the sphere carried the top all the time.
     assert (run.contact[run.t < run.stem_time] == 0).all()
+
+
+def test_a_page_says_what_a_run_says_of_its_end(run):
+    model, fallen = TopModel(scene=run.scene, launch=LAUNCH), run.t[(run.t > run.stem_time) & (run.contact == 0)][-1]
+    live, path = page_of_launch(model, None, T1), jnp.zeros((9, 1))
+    values = jnp.array([slider.value for slider in live.sliders])
+    for time, words in ((0.0, "fell back"), (fallen, "its sphere touches again"), (run.t[-1], "")):
+        end = run.at([time])
+        outcome = HybridOutcome(*[None] * 9)._replace(
+            state=jnp.concatenate([end.states, path]), mode=end.contact.astype(int)
+        )
+        assert AFTERWARDS[int(live.motion.outcome(values, outcome))] == AFTERWARDS[int(end.afterwards)] == words
 
 
 def test_the_trace_of_a_stem_that_bounces_is_no_zigzag(run):

@@ -52,12 +52,18 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
     # A page that is kept would be that of other scenes.
     monkeypatch.setenv("NONHOLONOMIC_CACHE", "0")
     arguments = ["--theta", "6", "18", "--mu", "0.2", "0.3", "--rpm", "1480", "--t1", "8", "--out", str(tmp_path)]
+    page_of_launch, horizons = job.page_of_launch, []
+    monkeypatch.setattr(job, "page_of_launch", lambda *given: horizons.append(given[2]) or page_of_launch(*given))
     assert main(arguments) == 0
+    # That of the tables.
+    assert horizons == [8.0]
     printed = capsys.readouterr().out
     assert printed.startswith(
         "A wooden top: 17.8 g, 40 mm across, a stem 10 mm thick, its centre of mass 1.77 mm below"
     )
     assert "I1 / I3 = 0.952 lies between 1 - a / R = 0.911 and 1 + a / R = 1.089, so it can turn over." in printed
+    slip = "Coulomb friction mu falls to zero below a slip speed of 0.05 m/s."
+    assert slip in printed
     assert printed.rstrip().endswith(f"To see the top move, open {tmp_path / 'index.html'}")
     assert "4 of 8 tops have turned over within 8 s." in printed
     rows = [line.split() for line in printed.splitlines() if line.strip().startswith("18 deg")]
@@ -71,6 +77,7 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
     assert "<td>18 deg</td>" in page
     assert "4 of 8 tops have turned over within 8 s." in page
     assert "window.live" in page
+    assert slip in page
     assert "A tippe top on a table" in page
     assert "data:image/png" in page
     # The same again, without three.js: the tables are read, and the page says what is missing.

@@ -196,7 +196,7 @@ def test_quantities_are_drawn_over_time_by_name_and_in_degrees(run):
     assert_close(portrait.get_lines()[0].get_ydata(), np.degrees(run.theta_rate))
     assert portrait.get_ylabel() == "θ' [deg/s]"
     curves = run.plot(unit="deg").axes
-    assert curves[0].get_ylabel() == "θ, normal to axis [deg]"
+    assert curves[0].get_ylabel() == "inclination θ [deg]"
     slower = run.at([0.5, 1.0])
     tilted = dataclasses.replace(slower, scene=tippe.Scene(run.scene.body, tippe.Plane(0.1), run.scene.friction))
     legend = run.plot("theta", others=[tilted], unit=("deg", "rpm")).axes[0].get_legend()
@@ -219,8 +219,8 @@ def test_a_launch_in_degrees_is_shown_in_degrees(run):
     assert in_degrees.plot("energy").axes[0].get_ylabel() == "energy [J]"
     assert in_degrees.portrait().axes[0].get_xlabel() == "inclination θ [deg]"
     assert "theta [deg]: " in repr(in_degrees.to_table())
-    assert 'normal to axis", "unit": "deg"' in in_degrees.view().html
-    assert 'normal to axis", "unit": "deg"' in in_degrees.explore().html
+    assert r'\u03b8", "unit": "deg"' in in_degrees.view().html
+    assert r'\u03b8", "unit": "deg"' in in_degrees.explore().html
     several = tippe.InversionTimes([launch, tippe.Launch(0.1, 155.0)], [5.0, 6.0], 0.1, t1=20.0).launch
     assert_close(several.theta, [np.radians(6.0), 0.1], rtol=1e-15)
     assert "spin=[1500, 1480.14] rpm" in repr(several)
@@ -232,7 +232,7 @@ def test_a_launch_in_degrees_is_shown_in_degrees(run):
     assert "velocity=(0.1, 0.2, 0.3) rad/s" in repr(tippe.Launch.degrees(6, 1500, angular_velocity=(0.1, 0.2, 0.3)))
     again = nonholonomic.simulate(run.scene, launch, 1.0, tolerance=1e-6)
     assert again.plot("theta").axes[0].get_ylabel() == "inclination θ [deg]"
-    assert 'normal to axis", "unit": "deg"' in nonholonomic.explore(run.scene, launch, t1=1.0).html
+    assert r'\u03b8", "unit": "deg"' in nonholonomic.explore(run.scene, launch, t1=1.0).html
 
 
 def test_labels_are_what_differs(run):

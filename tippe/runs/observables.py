@@ -75,6 +75,8 @@ def quantities_of(scene: Scene) -> dict[str, Quantity]:
 
 # The run of a top: one state at each time.
 
+#: What a top may do after it turned over: nothing, or lean less than 90 degrees, or stand on its sphere beside its stem.
+AFTERWARDS = ("", "fell back", "its sphere touches again")
 
 #: JAX's arrays, or NumPy's outside of transformations.
 Values: TypeAlias = Array | np.ndarray
@@ -303,9 +305,16 @@ class AbstractTrajectory(AbstractRun):
     def marks(self) -> Marks:
         if self.dense is None or not isinstance(self.scene.body, AbstractBody):
             return ()
-        time = self.inversion_time
-        fell = ", fell back" if float(self.theta[-1]) < np.pi / 2.0 else ""
-        return ((time, f"turned over at {time:.3g} s{fell}"),) if np.isfinite(time) else ()
+        time, afterwards = self.inversion_time, AFTERWARDS[int(self.afterwards)]
+        words = f"turned over at {time:.3g} s" + (f", {afterwards}" if afterwards else "")
+        return ((time, words),) if np.isfinite(time) else ()
+
+    @property
+    def afterwards(self) -> Int[Array, ""]:
+        """What a top that turned over has done by the last time, as an index of `AFTERWARDS`."""
+        is_told = self.scene.has_stem and self.scene.contact == "hybrid"
+        again = is_told and (self.contact[-1] >= 0) & (self.contact[-1] != 1)
+        return jnp.where(self.theta[-1] < 0.5 * jnp.pi, 1, jnp.where(again, 2, 0))
 
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:
@@ -345,9 +354,10 @@ class AbstractTrajectory(AbstractRun):
     @property
     def _whether_it_turned_over(self) -> str:
         """Whether and when the top turned over, as text."""
-        body, time = self.scene.body, self.inversion_time
+        body, time, afterwards = self.scene.body, self.inversion_time, AFTERWARDS[int(self.afterwards)]
         if np.isfinite(time):
-            return f"turned over at {time:.6g} s"
+            stem = ": the stem first carries it" if self.scene.has_stem and self.scene.contact == "hybrid" else ""
+            return f"turned over{stem} at {time:.6g} s" + (f", but {afterwards}" if afterwards else "")
         reason = ""
         if isinstance(self.scene.friction, Frictionless):
             reason = ": without friction no top turns over"
@@ -364,9 +374,7 @@ class AbstractTrajectory(AbstractRun):
             f"  theta: {factor * float(self.theta[0]):.6g} to {factor * float(self.theta[-1]):.6g} {angle}",
         ]
         if self.dense is not None and isinstance(self.scene.body, AbstractBody):
-            words = self._whether_it_turned_over
-            fell_back = words.startswith("turned") and float(self.theta[-1]) < np.pi / 2.0
-            lines.append(f"  {words}{', but fell back' if fell_back else ''}")
+            lines.append(f"  {self._whether_it_turned_over}")
         if word == "contact_lost" and self.scene.contact == "stop" and isinstance(self.scene.body, Top):
             lines.append("  to continue through the flight, use a Scene with contact='hybrid'")
         if "axis_drift" in self.stats:

@@ -256,13 +256,6 @@ class HybridTrajectory(AbstractTrajectory):
         # Also for traced numbers; -1 after the end of a run.
         return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
 
-    @property
-    def _whether_it_turned_over(self) -> str:
-        if not (self.scene.has_stem and np.isfinite(self.stem_time)):
-            return super()._whether_it_turned_over
-        again = ", and at the end its sphere touches again" if np.asarray(self.contact)[-1] in (0, 2) else ""
-        return f"turned over: the stem first carries it at {self.stem_time:.6g} s{again}"
-
     def reason(self) -> str:
         assert self.hops is not None
         contacts = sum(segment.number != BETWEEN for segment in self.dense.segments)

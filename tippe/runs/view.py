@@ -23,7 +23,7 @@ from nonholonomic.runs.table import at_the_end
 from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, page_of, runs_at_ends, sliders_of
 from nonholonomic.sweeps import chunk_for
 from nonholonomic.terminal import status_line
-from nonholonomic.text import Unit, readable_unit
+from nonholonomic.text import Unit, readable_unit, with_unit
 from nonholonomic.views.explore import Frame, LiveRun
 from nonholonomic.views.plot import new_figure
 
@@ -34,7 +34,7 @@ from ..model.scene import Launch, Scene
 from ..modes.plane import Slide
 from ..modes.problems import event_of
 from .model import INVERSIONS, REVERSALS, TopModel, of_launches
-from .observables import OF_RIGID_BODIES, QUANTITIES, AbstractTrajectory
+from .observables import AFTERWARDS, OF_RIGID_BODIES, QUANTITIES, AbstractTrajectory
 from .verbs import check_reversible, check_run
 
 # The drawing of a run: body, trace of the contact, path of the axis, arrows, and curves over time.
@@ -125,8 +125,8 @@ def show(scene: Scene, times: np.ndarray, frames: Frame[np.ndarray], number: int
         scale = length * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
         arrows.append(views.Arrow(arrow, start, vector, unit, scale, shade, width, None, True, False))
     rotation = OF_RIGID_BODIES["normal_spin"] if isinstance(body, AbstractRigidBody) else QUANTITIES["jellett"]
-    quantities = (QUANTITIES["energy"], rotation, QUANTITIES["normal_force"])
-    curves = [("θ, normal to axis", "rad"), *((part.long_name, readable_unit(part.unit)) for part in quantities)]
+    quantities = (QUANTITIES["theta"], QUANTITIES["energy"], rotation, QUANTITIES["normal_force"])
+    curves = zip(quantities, frames.curves, strict=True)
     return views.Show(
         name,
         colour,
@@ -139,7 +139,7 @@ def show(scene: Scene, times: np.ndarray, frames: Frame[np.ndarray], number: int
             views.Trace("path of the axis", axis[0], BLUE, 0.012 * radius, axis[1], False),
         ),
         tuple(arrows),
-        tuple(views.Curve(*curve, values) for curve, values in zip(curves, frames.curves, strict=True)),
+        tuple(views.Curve(part.long_name, readable_unit(part.unit), values) for part, values in curves),
     )
 
 
@@ -185,11 +185,8 @@ def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[views.M
         return views.striped(np.stack(meridian, axis=-1), (colour, views.PALE))
     radius = float(body.radius)
     if body.stem is None:
-        sphere = views.ball(radius, (colour, views.PALE))
-        return (
-            *sphere,
-            views.rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, views.DARK),
-        )
+        axis = views.rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, views.DARK)
+        return (*views.ball(radius, (colour, views.PALE)), axis)
     knob, end = float(body.stem.radius), float(body.stem.offset - body.offset)
     return (
         *views.striped(truncated(radius, knob, end), (colour, views.PALE)),
@@ -298,7 +295,8 @@ def page_of_launch(model: TopModel, sliders: Sliders | None, t1: float) -> LiveR
         answer=("reversal time" if reverses else answer, "s"),
         summaries=(1, 2),
         named=(REVERSALS if reverses else INVERSIONS).named,
-    )
+        afterwards=None if reverses else lambda drawn, ended: drawn.moment(ended.state, ended.mode).afterwards,
+    )._replace(afterwards=() if reverses else AFTERWARDS)
 
 
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
@@ -328,8 +326,7 @@ def stage_at_start(model: TopModel, t1: float) -> views.Stage:
     initial_show = show(scene, np.array([0.0, 1.0]), start, 0, "")
     # Slips grow as the top rises; a slip at half the speed of the equator gets the longest arrow.
     normal_force, slip, *arrows = initial_show.arrows
-    assert slip.limit is not None
-    slip = slip._replace(scale=slip.limit / max(0.5 * size * float(start.turning_rate[0]), 1e-12))
+    slip = slip._replace(scale=SLIP * size / max(0.5 * size * float(start.turning_rate[0]), 1e-12))
     initial_show = initial_show._replace(arrows=(normal_force, slip, *arrows))
     reach = max(REACH * math.sqrt(float(scene.gravity) * size) * t1, 10.0 * size)
     return views.Stage("", arena_of(scene, [start], start.normal[0], reach), (initial_show,), follows=True)
@@ -386,7 +383,7 @@ def draw_launches(panels: list[Panel], angle: float, dots: str, unit: str = "rad
         drawing.set_title(panel.title)
         drawing.set_xlabel("time [s]")
         drawing.set_yticks([0.0, np.pi / 2.0, np.pi], ["0", "π/2", "π"] if unit == "rad" else ["0", "90", "180"])
-    drawings[0].set_ylabel(f"θ, angle from the normal to the stem [{unit}]")
+    drawings[0].set_ylabel(with_unit(QUANTITIES["theta"].long_name, unit))
     figure.supxlabel(dots, fontsize=10)
     if len(panels[-1].starts) > 1:
         drawings[-1].legend(title="θ(0) [rad]", loc="center left", bbox_to_anchor=(1.01, 0.5))

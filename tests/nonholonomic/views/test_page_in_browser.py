@@ -366,7 +366,7 @@ def test_the_first_curve_is_large_and_checks_are_folded_away(browser):
         "return [...document.querySelectorAll('.strip')].map((one) => [one.querySelector('.head span').textContent,"
         "parseFloat(getComputedStyle(one).fontSize), one.checkVisibility()])"
     )
-    assert strips[0] == ["θ, normal to axis [deg]", 18, True]
+    assert strips[0] == ["inclination θ [deg]", 18, True]
     assert {size for _, size, _ in strips[1:]} == {14}
     hidden = sorted(label.partition(" [")[0] for label, _, is_shown in strips if not is_shown)
     assert hidden == ["Jellett's quantity", "energy"]
