@@ -238,8 +238,11 @@ window.views = window.views || {};
         stage.look(stage.fact.shows.map((_, r) => this.show(stage, r, this.now)), stage.follows);
         stage.render();
         stage.values.forEach((value, k) => {
-          const { shownSize, unit } = stage.runs[0].arrows[k];
-          if (value) value.textContent = ` ${views.digits(shownSize, 3)} ${unit}`;
+          if (!value) return;
+          // One number for each run, in the colour of the run if there are several.
+          const sizes = stage.runs.map(({ arrows }) => ` ${views.digits(arrows[k].shownSize, 3)} ${arrows[k].unit}`);
+          value.replaceChildren(...sizes.map((textContent) => Object.assign(document.createElement("span"), { textContent })));
+          if (sizes.length > 1) stage.fact.shows.forEach(({ colour }, r) => { value.children[r].style.color = colour; });
         });
       }
       this.strips.draw(this.now);

@@ -154,7 +154,7 @@ window.views = window.views || {};
       const bodies = fact.bodies.map((body) => this.body(body.meshes));
       // Traces of several runs have the colours of the runs.
       const traces = fact.traces.map((trace) => this.trace(this.fact.shows.length > 1 ? { ...trace, colour: fact.colour } : trace));
-      const arrows = fact.arrows.map((arrow) => this.arrow(arrow));
+      const arrows = fact.arrows.map((arrow) => this.arrow(arrow, this.fact.shows.length > 1 ? fact.colour : arrow.colour));
       const name = this.fact.shows.length > 1 ? element("span", this.labels, { className: "name", textContent: fact.name }) : null;
       if (name) name.style.background = fact.colour;
       return { bodies, traces, arrows, name, normal: [0, 0, 1] };
@@ -187,7 +187,7 @@ window.views = window.views || {};
     }
     // A shaft of length one, which is scaled, and a tip; an arrow that is visible through the body has a ball at its start.
     // A line has no unit, and no tip.
-    arrow({ colour, width, through, unit, factor, scale, limit, shown }) {
+    arrow({ colour, width, through, unit, factor, scale, limit, shown }, shade) {
       const { THREE, scene } = this, group = new THREE.Group(), head = unit ? 5 * width : 0;
       const material = new THREE.MeshPhongMaterial({ color: colour, specular: 0, depthTest: !through, transparent: through });
       const part = (geometry) => {
@@ -202,8 +202,8 @@ window.views = window.views || {};
       if (through) part(new THREE.SphereGeometry(1.8 * width, 20, 14));
       scene.add(group);
       const label = element("span", this.labels, { className: "force" });
-      // Dark enough to be read on the ground.
-      label.style.color = new THREE.Color(colour).multiplyScalar(0.5).getStyle();
+      // In the colour of the arrow, or of the run if there are several; dark enough to be read on the ground.
+      label.style.color = new THREE.Color(shade).multiplyScalar(0.5).getStyle();
       return { group, shaft, tip, head, unit, factor, scale, limit: limit ?? Infinity, label, shown, size: 0, shownSize: 0 };
     }
 
@@ -396,7 +396,7 @@ window.views = window.views || {};
           put(run.name, onScreen(over), 18);
         }
         for (const arrow of run.arrows) {
-          if (arrow.unit !== "N" || !arrow.group.visible || k > 0) { arrow.label.style.display = "none"; continue; }
+          if (arrow.unit !== "N" || !arrow.group.visible) { arrow.label.style.display = "none"; continue; }
           const end = new THREE.Vector3(0, arrow.length, 0).applyQuaternion(arrow.group.quaternion).add(arrow.group.position);
           arrow.label.textContent = `${views.digits(arrow.shownSize, 3)} N`;
           put(arrow.label, onScreen(end), 14);

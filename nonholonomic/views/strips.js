@@ -26,6 +26,19 @@ window.views = window.views || {};
   //: Room left of a curve for its numbers, and below it; the sizes of the texts in pixels.
   const LEFT = 66, FOOT = 5, TEXT = 13;
 
+  // The numbers at an axis: round ones, at least two; and its ends, moved to such a number if one is near.
+  function ticked(low, high, isAngle) {
+    const least = (high - low) / 4, power = 10 ** Math.floor(Math.log10(least));
+    const steps = isAngle && least > 10 && least <= 180 ? [15, 30, 45, 90, 180] : [1, 2, 5, 10].map((one) => one * power);
+    const step = steps.find((one) => one >= 0.999 * least);
+    const [first, last] = [Math.floor, Math.ceil].map((round, k) => step * round([low, high][k] / step));
+    [low, high] = [low - first < least ? first : low, last - high < least ? last : high];
+    const begin = Math.ceil(low / step - 1e-6), count = Math.floor(high / step + 1e-6) - begin + 1, most = Math.max(Math.abs(low), Math.abs(high));
+    const text = (v) => v === 0 ? "0" : most < 1e-3 || most >= 1e5 ? Number(v.toPrecision(6)).toExponential()
+      : v.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
+    return { low, high, ticks: Array.from({ length: count }, (_, k) => step * (begin + k)).map((v) => [v, text(v)]) };
+  }
+
   const labelOf = ({ name, unit }) => (unit ? `${name} [${unit}]` : name);
 
   class Strips {
@@ -45,12 +58,14 @@ window.views = window.views || {};
         views.element("summary", details, { textContent: "More curves" });
         return views.element("div", details, { className: "strips" });
       };
-      this.strips = labels.sort((a, b) => folded(a) - folded(b)).map((label) => {
+      this.strips = labels.sort((a, b) => folded(a) - folded(b)).map((label, k) => {
         if (folded(label)) fold = fold || more();
         const box = views.element("div", fold || parent, { className: "strip" }), head = views.element("div", box, { className: "head" });
         views.element("span", head, { textContent: label });
         const value = views.element("span", head, { className: "value" }), canvas = views.element("canvas", box);
-        const strip = { label, canvas, value };
+        // Below the first curve, where they cover none.
+        const told = k === 0 ? views.element("div", box, { className: "told" }) : null;
+        const strip = { label, canvas, value, told };
         const at = (event) => {
           const edge = canvas.getBoundingClientRect(), part = (event.clientX - edge.left - LEFT) / (edge.width - LEFT - 4);
           return Math.min(Math.max(part, 0), 1) * this.duration;
@@ -79,10 +94,14 @@ window.views = window.views || {};
         // Draw values that are constant except for round-off as a constant.
         const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high)) || 1;
         if (!(high - low > least)) { low -= least; high += least; }
-        // Label what is no pixel away from 0 as 0, such as the round-off of a body at the ground.
+        // What is no pixel away from 0 is 0, such as the round-off of a body at the ground.
         const rounded = (end) => Math.abs(end) < 1e-3 * (high - low) ? 0 : end;
-        [low, high] = [rounded(low), rounded(high)];
-        Object.assign(strip, { low, high, ahead: null });
+        Object.assign(strip, ticked(rounded(low), rounded(high), strip.label.endsWith("[deg]")), { ahead: null });
+        strip.told?.replaceChildren(...strip.curves.flatMap(({ colour, marks }) => marks.map(([, textContent]) => {
+          const words = Object.assign(document.createElement("span"), { textContent });
+          words.style.color = colour;
+          return words;
+        })));
       }
     }
     paint(strip) {
@@ -117,27 +136,22 @@ window.views = window.views || {};
       if (!strip.ahead) this.paint(strip);
       const { canvas, x0, x1, y0, y1, ratio } = strip, pen = canvas.getContext("2d"), now = strip.x(time);
       pen.clearRect(0, 0, canvas.width, canvas.height);
-      Object.assign(pen, { fillStyle: "#23262b", font: `${TEXT * ratio}px system-ui, sans-serif`, textAlign: "right" });
-      pen.fillText(digits(strip.high, 3), x0 - 6 * ratio, y1 + 8 * ratio);
-      pen.fillText(digits(strip.low, 3), x0 - 6 * ratio, y0);
+      Object.assign(pen, { fillStyle: "#23262b", font: `${TEXT * ratio}px system-ui, sans-serif`, textAlign: "right", textBaseline: "middle" });
       Object.assign(pen, { strokeStyle: "#dde1e6", lineWidth: ratio });
       pen.strokeRect(x0, y1, x1 - x0, y0 - y1);
+      for (const [tick, text] of strip.ticks) {
+        const at = strip.y(tick), half = 0.5 * TEXT * ratio;
+        pen.beginPath(); pen.moveTo(x0, at); pen.lineTo(x1, at); pen.stroke();
+        pen.fillText(text, x0 - 6 * ratio, Math.min(Math.max(at, half), canvas.height - half));
+      }
       pen.drawImage(strip.ahead, 0, 0);
       pen.save(); pen.beginPath(); pen.rect(0, 0, now, canvas.height); pen.clip(); pen.drawImage(strip.passed, 0, 0); pen.restore();
       const upright = (at, dashes, colour = "#23262b") => {
         pen.strokeStyle = colour; pen.setLineDash(dashes); pen.beginPath(); pen.moveTo(at, y0); pen.lineTo(at, y1); pen.stroke(); pen.setLineDash([]);
       };
-      strip.curves.forEach(({ times, values, colour, marks }, k) => marks.forEach(([at, words]) => {
+      strip.curves.forEach(({ times, values, colour, marks }) => marks.forEach(([at]) => {
         upright(strip.x(at), [2 * ratio, 2 * ratio], colour);
         pen.fillStyle = colour; pen.beginPath(); pen.arc(strip.x(at), strip.y(valueAt(values, place(times, at))), 4 * ratio, 0, 7); pen.fill();
-        if (strip !== this.strips[0]) return;
-        const left = strip.x(at) < 0.6 * x1;
-        pen.textAlign = left ? "left" : "right";
-        const label = [words, strip.x(at) + (left ? 6 : -6) * ratio, y0 - (6 + 1.2 * TEXT * k) * ratio];
-        // Readable over curves.
-        pen.save();
-        Object.assign(pen, { strokeStyle: "#ffffffd9", lineWidth: 5 * ratio, lineJoin: "round" });
-        pen.strokeText(...label); pen.restore(); pen.fillText(...label);
       }));
       upright(now, []);
       if (this.pointed !== null) upright(strip.x(this.pointed), [3 * ratio, 3 * ratio]);

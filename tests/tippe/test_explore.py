@@ -364,6 +364,9 @@ def test_a_phone_in_portrait_shows_all_controls(browser, page):
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     try:
         assert browser.execute_script("return document.documentElement.scrollWidth <= innerWidth")
+        assert browser.execute_script(
+            "const { scrollWidth, clientWidth } = document.querySelector('figcaption'); return scrollWidth <= clientWidth"
+        )
         uncovered = browser.execute_script(CONTROLS)
         assert len(uncovered) > 6
         assert all(uncovered)

@@ -12,6 +12,7 @@ import stroller
 import tippe
 from nonholonomic import simulate
 from nonholonomic.views import COLOURS, page
+from nonholonomic.views.pages import table_as_html
 from nonholonomic.views.stage import css, curves_in
 
 pytestmark = needs_browser
@@ -199,6 +200,14 @@ def test_the_curves_of_several_runs_are_named_in_their_colours(browser, stages):
     shows = [show for stage in stages for show in stage.shows]
     colours = [f"rgb({show.colour >> 16}, {show.colour >> 8 & 255}, {show.colour & 255})" for show in shows]
     assert browser.execute_script(names) == [[show.name, colour] for show, colour in zip(shows, colours, strict=True)]
+    # So are the numbers of the arrows.
+    chips = (
+        "[...document.querySelectorAll('figure:last-child .chip')].map((one) => [...one.querySelectorAll('span span')])"
+    )
+    numbers = browser.execute_script(
+        f"player.seek(0.3); return {chips}.map((all) => all.map((one) => one.style.color))"
+    )
+    assert [numbers[-1], numbers[0]] == [colours[1:], []]
 
 
 def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
@@ -218,15 +227,37 @@ def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
     assert browser.execute_script("return player.time()") == pytest.approx((width / 2 - 66) / (width - 70), abs=0.01)
 
 
-def test_round_off_at_the_end_of_a_curve_is_labelled_as_zero(browser):
-    """A body at the ground is at 0 m, and not at -1.15e-10 m."""
+@pytest.mark.parametrize(
+    ("unit", "values", "ends", "ticks"),
+    [
+        # A body at the ground is at 0 m, and not at -1.15e-10 m.
+        ("m", [1.0, -1.15e-10, 0.5], (0.0, 1.0), ["0", "0.5", "1.0"]),
+        ("deg", [0.271, 172.0], (0.0, 180.0), ["0", "45", "90", "135", "180"]),
+        ("N", [0.113, 0.208], (0.1, 0.208), ["0.10", "0.15", "0.20"]),
+        ("J", [-7.0e-6, 1.1e-6], (-7.0e-6, 1.1e-6), ["-5e-6", "0"]),
+    ],
+)
+def test_the_numbers_at_a_curve_are_round(browser, unit, values, ends, ticks):
     script = (
-        "const curve = { label: 'height', factor: 1, values: [1, -1.15e-10, 0.5] };"
-        "const run = { times: [0, 1, 2], colour: 'red', curves: [curve] };"
-        "const { low, high } = new views.Strips(document.createElement('div'), () => [run], () => 0).strips[0];"
-        "return [low, high]"
+        f"const curve = {{ name: 'a', unit: '{unit}', factor: 1, values: {values} }};"
+        "const run = { times: [0, 1, 2], colour: 'red', curves: [curve], marks: [] };"
+        "const { low, high, ticks } = new views.Strips(document.createElement('div'), () => [run], () => 0).strips[0];"
+        "return [[low, high], ticks.map(([, text]) => text)]"
     )
-    assert browser.execute_script(script) == [0.0, 1.0]
+    (low_and_high, texts) = browser.execute_script(script)
+    assert low_and_high == pytest.approx(ends)
+    assert texts == ticks
+
+
+def test_tables_fit_on_a_phone(browser):
+    rows = [["theta(0)", *(f"mu = {0.1 * k:.1f}" for k in range(1, 6))], ["18 deg", *["not in time"] * 5]]
+    widths = browser.execute_script(
+        "const box = document.createElement('div'); box.style.width = '374px'; box.innerHTML = arguments[0];"
+        "document.body.append(box); const { scrollWidth, clientWidth } = box.firstChild; box.remove();"
+        "return [scrollWidth, clientWidth]",
+        table_as_html(rows, 1),
+    )
+    assert widths[0] <= widths[1]
 
 
 def test_a_run_is_replaced_while_the_page_is_open(browser, top):
@@ -387,6 +418,12 @@ for (let k = 0; k < data.length; k += 4) red += data[k] > 150 && data[k + 1] < 1
 return red;
 """
     marked = browser.execute_script(count)
+    # The words stand below the curve, where they cover nothing.
+    told = browser.execute_script(
+        "const told = document.querySelector('.told'), above = told.previousSibling;"
+        "return [told.textContent, told.getBoundingClientRect().top >= above.getBoundingClientRect().bottom]"
+    )
+    assert told == ["turned over at 0.25 s", True]
     browser.execute_script("player.setRun(0, 0, { marks: [] })")
     assert marked > browser.execute_script(count) + 20
 
