@@ -321,27 +321,31 @@ def one_line(module: PyTree, with_units: bool = True) -> str:
 
 
 def distinguishing_labels(
-    starts: list[tuple[str, ...]], *groups: list[Any], unit: Unit = None, longest: int | None = MOST_CHARACTERS
+    starts: list[tuple[str, ...]], *groups: list[Any], unit: Unit = None, longest: float = MOST_CHARACTERS
 ) -> list[str]:
     """Labels that distinguish runs, by what differs between them only.
 
-    **Arguments:** `starts`: for each run, the same number of texts, such as its angle and its spin; `groups`: modules of
-    one role, such as the scenes, one per run; `unit`: units for their numbers, as for `in_unit`; `longest`: the number of
-    characters that a label may have, `None` for any.
+    **Arguments:** `starts`: for each run, the same number of texts, such as its angle and its spin, the most important first;
+    `groups`: modules of one role, such as the scenes, one per run; `unit`: units for their numbers, as for `in_unit`;
+    `longest`: the number of characters that a label may have.
 
-    **Returns:** the labels; one of several that would be longer ends in "…". If nothing differs, a label is the whole start;
-    equal labels are numbered.
+    **Returns:** the labels, of the parts that tell the runs apart, and of others as far as there is room; "…" stands for more.
+    If nothing differs, a label is the whole start; equal labels are numbered.
     """
-    differing = [k for k, texts in enumerate(zip(*starts, strict=True)) if len(set(texts)) > 1]
-    parts = [[start[k] for k in differing] for start in starts]
-    for group in groups:
-        parts = [part + difference for part, difference in zip(parts, differences(group, unit), strict=True)]
-    names = [", ".join(part or start) for part, start in zip(parts, starts, strict=True)]
-    for k, name in enumerate(names):
-        if longest is not None and len(name) > longest and len(names) > 1:
-            # Cut after the last part that is whole, if any is.
-            end = name.rfind(", ", 0, longest + 2)
-            names[k] = f"{name[: longest if end < 0 else end]}, …"
+    columns = [texts for texts in zip(*starts, strict=True) if len(set(texts)) > 1]
+    columns += [texts for group in groups for texts in zip(*differences(group, unit), strict=True)]
+    names, chosen, apart = [", ".join(start) for start in starts], [], 1
+    for tells_apart in (True, False):
+        for column in columns:
+            parts = [other for other in columns if other in chosen or other is column]
+            longer = [", ".join(texts) for texts in zip(*parts, strict=True)]
+            room = longest - len(", …") * (len(parts) < len(columns))
+            if len(set(longer)) > apart if tells_apart else max(map(len, longer)) <= room:
+                names, chosen, apart = longer, parts, len(set(longer))
+    if len(chosen) < len(columns):
+        names = [f"{name}, …" for name in names]
+    if len(names) > 1:
+        names = [name if len(name) <= longest else f"{name[: int(longest) - 1]}…" for name in names]
     count = names.count
     return [name if count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)]
 

@@ -168,7 +168,7 @@ class AbstractTimes(AbstractEventTimes):
         launches = [
             jax.tree.map(lambda leaf, k=k: leaf if np.ndim(leaf) == 0 else leaf[k], launch) for k in range(count)
         ]
-        return tuple(distinguishing_labels([("launch",)] * count, launches, unit=unit, longest=None))
+        return tuple(distinguishing_labels([("launch",)] * count, launches, unit=unit, longest=math.inf))
 
 
 class InversionTimes(AbstractTimes):

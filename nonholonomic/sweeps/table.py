@@ -16,9 +16,8 @@ from jaxtyping import Int
 from ..terminal import status_line
 from ..text import as_html, in_unit, likely, readable_unit, require_unit, require_unit_of, shown, text_as_html, unit_of
 from ..validation import as_path, replacing, require_package
-from ..views.pages import Viewable, draw_curves, require_labels, require_others
+from ..views.pages import Viewable, require_labels, require_others
 from ..views.plot import draw_portrait, draw_series, draw_table, draw_title
-from ..views.stage import curves_in
 from ._store import Stored, contents_of, table_path, write_file
 from .grid import FOR_A_TIME, PENDING, REMARK, SHOWN_IN, UNREACHED, Layout, Tabulated, Values, attributes_of, axes_of
 
@@ -604,13 +603,19 @@ class Tabular(Viewable, abc.ABC):
         title, labels = (labels[0], [""]) if label is None and len(runs) == 1 else ("", labels)
         if quantities:
             tables = [run.table_of(quantities).drawn_in(unit, *quantities) for run in runs]
-            factor = in_unit("s", unit)[1]
-            marks = [tuple((factor * t, text) for t, text in run.marks if run.t[0] <= t <= run.t[-1]) for run in runs]
-            drawing = draw_series(tables, quantities, labels, marks, ax)
         elif ax is None:
-            drawing = draw_curves(curves_in(self.stages(runs[1:]), unit), labels)
+            shows = [show for stage in self.stages(runs[1:]) for show in stage.shows]
+            units = {curve.name: curve.unit or "1" for show in shows for curve in show.curves}
+            quantities, tables = tuple(units), []
+            for show in shows:
+                curves = dict.fromkeys(units, np.full(len(show.times), np.nan))
+                curves |= {curve.name: curve.values for curve in show.curves}
+                tables.append(Table({"time": show.times}, curves, units | {"time": "s"}, {}).drawn_in(unit, *units))
         else:
             raise ValueError(f"ax takes one quantity: name it, as in plot({next(iter(self))!r}, ax=ax)")
+        factor = in_unit("s", unit)[1]
+        marks = [tuple((factor * t, text) for t, text in run.marks if run.t[0] <= t <= run.t[-1]) for run in runs]
+        drawing = draw_series(tables, quantities, labels, marks, ax)
         if ax is None:
             draw_title(drawing.figure, title)
         return drawing

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -30,15 +30,7 @@ from jaxtyping import ArrayLike, Float
 from ..terminal import status_line
 from ..text import Unit, require_unit, shown, unit_of
 from ..validation import replacing, require, require_file, require_increasing, require_package
-from .plot import legend_above, new_figure
 from .stage import Arrow, Draw, Marks, Stage, Trace, css, curves_in, finite
-
-# Only for type checkers: matplotlib is optional.
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-#: Relative range of values below which a panel of curves draws them as constant.
-LEAST_RANGE = 1e-3
 
 #: Selectable speeds of time.
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -443,37 +435,6 @@ def require_labels(label: Label, runs: list[Any]) -> list[str]:
     if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
         raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
     return list(labels)
-
-
-def draw_curves(stages: list[Stage], names: Sequence[str]) -> "Figure":
-    """Draw the curves of all runs on stages over time, with a panel for each label.
-
-    **Arguments:** `names`: names of the runs for the legend.
-
-    **Returns:** a matplotlib figure.
-    """
-    shows = [show for stage in stages for show in stage.shows]
-    labels = list(dict.fromkeys(curve.label for show in shows for curve in show.curves))
-    figure = new_figure(7.0, 1.3 + 1.5 * len(labels))
-    panels = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
-    for label, panel in zip(labels, panels, strict=True):
-        for show, name in zip(shows, names, strict=True):
-            style = {"color": css(show.colour), "linewidth": 1.0}
-            for curve in show.curves:
-                if curve.label == label:
-                    panel.plot(show.times, curve.factor * curve.values, label=name or None, **style)
-            for moment, words in show.marks:
-                panel.axvline(moment, linestyle=":", label=words, **style)
-        panel.margins(x=0.0)
-        ends = panel.get_ylim()
-        # Draw values that are constant except for round-off as a constant.
-        least = LEAST_RANGE * np.max(np.abs(ends))
-        if np.ptp(ends) < least:
-            panel.set_ylim(np.mean(ends) - least, np.mean(ends) + least)
-        panel.set_ylabel(label, fontsize="small")
-    panel.set_xlabel("time [s]")
-    legend_above(panels[0])
-    return figure
 
 
 # Films, recorded by a browser.

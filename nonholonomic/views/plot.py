@@ -12,7 +12,7 @@ import numpy as np
 from ..parameters import meant, short_names
 from ..text import UNITS, Unit, in_unit, likely, readable_unit, shown, with_unit
 from ..validation import require
-from .stage import Marks
+from .stage import COLOURS, Marks, css
 
 # Only for type checkers: matplotlib is optional, and plots stand below tables and fits, which use them.
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ QUANTILES = (0.02, 0.98)
 #: Relative difference from a value of an axis that counts as none.
 ROUND_OFF = 1e-9
 
-#: An axis with at most this many values is drawn as one line per value; height of the first line's marks of cells without a
-#: value, as a part of the picture.
+#: An axis with at most this many values is drawn as one line per value; height of each line's marks of cells without a value,
+#: as a part of the picture.
 MOST_LINES, MARK = 8, 0.03
 
 #: More points of a bifurcation diagram than this are drawn smaller.
@@ -137,6 +137,9 @@ def draw_table(
         drawing.plot(abscissa.ravel(), visible.ravel(), "o", markersize=size, mew=0.0, label=label, rasterized=True)
     else:
         _draw_lines(drawing, table, names, visible.reshape(len(visible), -1), label, words)
+        if drawing.get_legend_handles_labels()[1]:
+            # In a new figure there is room beside the lines.
+            drawing.legend(**({"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)} if ax is None else {}))
     if log and not is_map:
         drawing.set_yscale("log")
         _plain_numbers(drawing.yaxis)
@@ -212,38 +215,29 @@ def _cut_text(table: "Table", name: str, place: int, wanted: float | None = None
 def _draw_lines(
     drawing: "Axes", table: "Table", names: list[str], lines: np.ndarray, label: str | None, words: np.ndarray | None
 ) -> None:
-    """Draw a line for each column, and at the bottom the marks of the statuses of cells without a finite value; without any
-    finite value, count the statuses."""
+    """Draw a line for each column, and in a strip above them the statuses of cells without a finite value."""
     marker, values = "o-" if len(lines) <= 100 else "-", table.coords[names[0]]
     has_number = np.isfinite(lines)
-    lost = np.full(lines.shape, "")
-    if words is not None and np.any(has_number):
-        lost = np.where(has_number, "", words.reshape(lines.shape))
+    lost = np.full(lines.shape, "") if words is None else np.where(has_number, "", words.reshape(lines.shape))
     marks = dict(zip(filter(None, np.unique(lost).tolist()), "x+1234", strict=False))
+    strip = drawing
+    if marks:
+        # Outside of the scale of the values, and above the strips of earlier plots in these axes.
+        ends = [child.bbox.transformed(drawing.transAxes.inverted()).y1 for child in drawing.child_axes]
+        place = 0.0, max([1.0, *ends]), 1.0, MARK * (1 + lines.shape[1])
+        strip = drawing.inset_axes(place, sharex=drawing, facecolor="0.9", ylim=(-1.0, lines.shape[1]))
+        strip.set_yticks([0.5 * (lines.shape[1] - 1)], ["\n".join(marks).replace("_", " ")], fontsize="small")
+        strip.tick_params(length=0.0, labelbottom=False)
     for index, line in enumerate(lines.T):
         texts = [label or "", _cut_text(table, names[1], index) if len(names) > 1 else ""]
         text = ", ".join(filter(None, texts))
         (curve,) = drawing.plot(values, line, marker, markersize=3, label=text or None)
         for word, mark in marks.items():
-            heights = np.where(lost[:, index] == word, MARK * (1 + index), np.nan)
-            drawing.plot(values, heights, mark, color=curve.get_color(), transform=drawing.get_xaxis_transform())
-    for word, mark in marks.items():
+            strip.plot(values, np.where(lost[:, index] == word, index, np.nan), mark, color=curve.get_color())
+    for word, mark in marks.items() if len(marks) > 1 else ():
         drawing.plot([], [], mark, color="0.35", label=word.replace("_", " "))
-    if marks:
-        # A strip of its own, so that a mark is not read as a value.
-        drawing.axhspan(
-            0.0, MARK * (1 + lines.shape[1]), color="0.9", transform=drawing.get_xaxis_transform(), zorder=0
-        )
-    if drawing.get_legend_handles_labels()[1]:
-        drawing.legend()
     if not np.any(has_number):
-        # The abscissa stays that of the table.
-        if values.dtype.kind != "U" and len(values) > 1:
-            drawing.set_xlim(values.min(), values.max())
-        kinds = [] if words is None else np.unique(words)
-        counts = ", ".join(f"{np.sum(words == word)} {word.replace('_', ' ')}" for word in kinds)
-        text = ": ".join(filter(None, ["nothing finite to draw", counts]))
-        drawing.text(0.5, 0.5, text, transform=drawing.transAxes, ha="center", va="center")
+        drawing.text(0.5, 0.5, "nothing finite to draw", transform=drawing.transAxes, ha="center", va="center")
 
 
 def _draw_map(
@@ -313,7 +307,7 @@ def draw_portrait(table: "Table", x: str, y: str, ax: "Axes | None" = None) -> "
     """
     (x_values, x_label), (y_values, y_label) = column(table, "x", x), column(table, "y", y)
     drawing = new_figure(5.0, 4.5).add_subplot() if ax is None else ax
-    (line,) = drawing.plot(x_values, y_values, linewidth=1.0)
+    (line,) = drawing.plot(x_values, y_values, linewidth=1.0, color=css(COLOURS[0]) if ax is None else None)
     drawing.plot(x_values[:1], y_values[:1], "o", color=line.get_color())
     drawing.set_xlabel(x_label)
     drawing.set_ylabel(y_label)
@@ -331,7 +325,7 @@ def column(table: "Table", argument: str, name: object, vectors: bool = False) -
     """
     if not isinstance(name, str):
         raise ValueError(f"{argument} = {shown(name)} must name a quantity, such as {next(iter(table.variables))!r}")
-    variable, _, component = name.partition(".")
+    variable, _, component = (name, "", "") if name in table.variables else name.partition(".")
     dims = table.inner.get(variable, ())
     if variable in table.variables and not component and not dims:
         return table[variable], table.label(variable)
@@ -345,6 +339,9 @@ def column(table: "Table", argument: str, name: object, vectors: bool = False) -
 
 
 # Plots of quantities of runs over time (needs matplotlib).
+
+#: Relative range of values below which a panel draws them as constant.
+LEAST_RANGE = 1e-3
 
 #: Styles of the lines of a vector's components; marks of times are dotted.
 STYLES = ("-", "--", "-.", ":")
@@ -372,6 +369,9 @@ def draw_series(
     if ax is None:
         figure = new_figure(PANEL[0], 1.5 + PANEL[1] * len(names))
         panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        for panel in panels:
+            # The colours of a page.
+            panel.set_prop_cycle(color=[css(colour) for colour in COLOURS])
     else:
         figure, panels = None, [ax]
     explained: list[str] = []
@@ -397,6 +397,10 @@ def draw_series(
         for (component, _), style in zip(lines if len(tables) > 1 and lines[0][0] else (), itertools.cycle(STYLES)):
             panel.plot([], [], style, color="0.35", linewidth=1.2, label=component)
         panel.margins(x=0.0)
+        # Draw values that are constant except for round-off as a constant.
+        middle, least = np.mean(panel.get_ylim()), LEAST_RANGE * np.max(np.abs(panel.get_ylim()))
+        if np.ptp(panel.get_ylim()) < least:
+            panel.set_ylim(middle - least, middle + least)
         # Not again below a panel that has the same.
         if (texts := panel.get_legend_handles_labels()[1]) != explained:
             legend_above(panel)

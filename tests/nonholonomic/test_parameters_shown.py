@@ -1,5 +1,8 @@
 """Numbers, units and modules as a person reads them."""
 
+import dataclasses
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,14 +96,28 @@ def test_labels_of_runs_leave_room_for_the_picture():
     assert texts == ["wooden top", "cohen top", "rutstam top"]
     own = tippe.simulate(tippe.Scene(tippe.Top(0.02, 0.02, 0.005, 3e-6, 3.2e-6), contact="hybrid"), launch, t1=0.01)
     assert runs[1].labels_of([runs[1], own], None) == ["cohen top, Viscous", "own top, Frictionless"]
-    assert max(map(len, texts)) <= 30 + len(", …")
+    heavy = dataclasses.replace(own, scene=eqx.tree_at(lambda scene: scene.body.mass, own.scene, jnp.asarray(0.03)))
+    names = ["cohen top, mass 0.015 kg, …", "own top, mass 0.02 kg, …", "own top, mass 0.03 kg, …"]
+    assert runs[1].labels_of([runs[1], own, heavy], None) == names
+    assert max(map(len, texts)) <= 30
     assert panel.get_position().width > 0.8
     assert legend.get_window_extent().y0 >= panel.get_window_extent().y1
     long = distinguishing_labels([("a" * 20, "b" * 20, "c"), ("d" * 20, "b" * 20, "e"), ("a" * 20, "b" * 20, "f")])
     assert long == ["aaaaaaaaaaaaaaaaaaaa, c", "dddddddddddddddddddd, e", "aaaaaaaaaaaaaaaaaaaa, f"]
     cut = distinguishing_labels([("a" * 20, "b" * 20), ("a" * 20, "c" * 20), ("d", "b" * 20)])
-    assert cut == ["aaaaaaaaaaaaaaaaaaaa, … (1)", "aaaaaaaaaaaaaaaaaaaa, … (2)", "d, bbbbbbbbbbbbbbbbbbbb"]
-    assert distinguishing_labels([("a" * 40,), ("b",)]) == [f"{'a' * 30}, …", "b"]
+    assert cut == ["aaaaaaaaaaaaaaaaaaaa, bbbbbbb…", "aaaaaaaaaaaaaaaaaaaa, ccccccc…", "d, bbbbbbbbbbbbbbbbbbbb"]
+    assert distinguishing_labels([("a" * 40,), ("b",)]) == [f"{'a' * 29}…", "b"]
+    # What tells runs apart comes before what does not, and then as much as there is room for.
+    starts = [("one", "x" * 15, "p"), ("one", "y" * 15, "p"), ("two", "y" * 15, "q"), ("two", "y" * 15, "p")]
+    assert distinguishing_labels(starts) == [f"{a}, {b}, {c}" for a, b, c in starts]
+    starts = [(*start, f"{k} and much more") for k, start in enumerate(starts)]
+    assert distinguishing_labels(starts) == [f"{a}, {b}, {c}, …" for a, b, c, _ in starts]
+    of_two_tops = [("wooden top", "6 deg"), ("own top", "6 deg"), ("own top", "6 deg")]
+    assert distinguishing_labels(of_two_tops, [tippe.Viscous(mu) for mu in (0.3, 0.3, 0.1)]) == [
+        "wooden top, mu 0.3 s/m",
+        "own top, mu 0.3 s/m",
+        "own top, mu 0.1 s/m",
+    ]
 
 
 def test_numbers_are_shown_in_other_units():

@@ -16,6 +16,8 @@ from tops import rutstam_top
 
 import nonholonomic
 import tippe
+from nonholonomic import views
+from nonholonomic.views.stage import css
 from tippe.__main__ import main
 
 GOOD = {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 2.994e-6, "I3": 3.2e-6}
@@ -201,7 +203,7 @@ def test_quantities_are_drawn_over_time_by_name_and_in_degrees(run):
     tilted = dataclasses.replace(slower, scene=tippe.Scene(run.scene.body, tippe.Plane(0.1), run.scene.friction))
     legend = run.plot("theta", others=[tilted], unit=("deg", "rpm")).axes[0].get_legend()
     theta, spin = np.degrees(slower.theta[0]), float(slower.spin[0]) * 30.0 / np.pi
-    assert legend.get_texts()[1].get_text() == f"θ(0) = {theta:.3g} deg, {spin:.4g} rpm, …"
+    assert legend.get_texts()[1].get_text() == f"θ {theta:.3g} deg, {spin:.4g} rpm, …"
 
 
 def test_a_launch_in_degrees_is_shown_in_degrees(run):
@@ -246,7 +248,10 @@ def test_labels_are_what_differs(run):
 
     assert texts() == ["mu 0.3 s/m", "mu 0.2 s/m"]
     assert texts(label=["rough", "smooth"]) == ["rough", "smooth"]
-    legend = run.plot(others=[other]).axes[0].get_legend()
+    figures = [run.plot(others=[other]), run.plot("theta", others=[other])]
+    colours = [[line.get_color() for line in figure.axes[0].get_lines()] for figure in figures]
+    assert colours == [[css(colour) for colour in views.COLOURS[:2]]] * 2
+    legend = figures[0].axes[0].get_legend()
     assert [text.get_text() for text in legend.get_texts()] == ["mu 0.3 s/m", "mu 0.2 s/m"]
     (panel,) = run.plot("theta", label="my top").axes
     assert panel.get_legend().get_texts()[0].get_text() == "my top"

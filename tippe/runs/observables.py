@@ -291,13 +291,15 @@ class AbstractTrajectory(AbstractRun):
             next((f"{name} top" for name, top in TOPS.items() if eqx.tree_equal(top(), s.body)), "own top")
             for s in scenes
         ]
+        theta = "θ(0) =" if len(runs) == 1 else "θ"
         starts = [
-            (f"θ(0) = {per_angle * float(run.theta[0]):.3g} {angle}", f"{per_rate * float(run.spin[0]):.4g} {rate}")
+            (f"{theta} {per_angle * float(run.theta[0]):.3g} {angle}", f"{per_rate * float(run.spin[0]):.4g} {rate}")
             for run in runs
         ]
-        if tops.count("own top") < min(2, len(runs)):
+        if set(tops) != {"own top"}:
             # The names of presets say more than their numbers.
             starts = [(top, *start) for top, start in zip(tops, starts, strict=True)]
+        if tops.count("own top") < 2:
             scenes = [eqx.tree_at(lambda scene: scene.body, scene, scenes[0].body) for scene in scenes]
         return distinguishing_labels(starts, scenes, unit=unit)
 

@@ -15,6 +15,7 @@ from browser import needs_browser, open_browser, wait
 from scipy.spatial.transform import Rotation
 
 from nonholonomic.geometry import Cylinder, Graph, Implicit, Paraboloid, Plane, Sphere, Spheroid, Torus
+from nonholonomic.sweeps import Table
 from nonholonomic.views import (
     Arrow,
     Body,
@@ -27,7 +28,8 @@ from nonholonomic.views import (
     page,
     quaternion,
 )
-from nonholonomic.views.pages import Viewable, draw_curves
+from nonholonomic.views.pages import Viewable
+from nonholonomic.views.plot import draw_series
 
 SURFACES = (
     (Plane(), (0.3, 0.1)),
@@ -206,9 +208,11 @@ def test_what_cannot_be_filmed_is_refused(options, message, tmp_path):
 
 
 def test_curves_are_drawn_and_what_is_constant_is_flat():
-    stage = rolling()
-    x, z = draw_curves([stage], [""]).axes
-    np.testing.assert_array_equal(x.lines[0].get_ydata(), stage.shows[0].curves[0].values)
+    (show,) = rolling().shows
+    curves = {curve.name: curve.values for curve in show.curves}
+    tables = [Table({"time": show.times}, curves, dict.fromkeys(curves, "m") | {"time": "s"}, {})]
+    x, z = draw_series(tables, list(curves), [""], [()]).axes
+    np.testing.assert_array_equal(x.lines[0].get_ydata(), show.curves[0].values)
     assert x.get_ylabel() == "x [m]"
     low, high = z.get_ylim()
     assert low < 0.1 < high
