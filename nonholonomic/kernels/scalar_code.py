@@ -327,28 +327,43 @@ class _Block(AbstractScalarReader):
         """Elements at indices that may be known only in JavaScript, which then selects among all possible indices."""
         pool = _flat([value for k, value in enumerate(inputs) if k not in indices])
         unknown = [(k, place) for k in indices for place, x in np.ndenumerate(inputs[k]) if isinstance(x, str)]
-        labels, values = itertools.count(), []
+        names = [np.asarray(inputs[k][place], object) for k, place in unknown]
+        labels, is_sum = itertools.count(), equation.primitive.name == "scatter-add"
         labelled = [value if k in indices else _map(lambda _: next(labels), value) for k, value in enumerate(inputs)]
-        # A gather beyond the end fills with a number that is not a label.
-        pick = functools.partial(_map, lambda k: pool[k] if 0 <= k < len(pool) else math.nan)
+
+        def at(option: dict[int, int]) -> Values:
+            # The labels of the elements, or their sums, with some of the unknown indices, and 0 for the others.
+            operands = [value.copy() for value in labelled]
+            for number, (k, index) in enumerate(unknown):
+                operands[k][index] = option.get(number, 0)
+            if is_sum:
+                return [self.summed_at(equation, inputs[0], operands[1], inputs[2])]
+            # An index beyond the end gives -1, which is not a label.
+            parameters = equation.params | ({"fill_value": -1} if "fill_value" in equation.params else {})
+            output = equation.primitive.bind(*(operand.astype(int) for operand in operands), **parameters)
+            return [np.asarray(part) for part in jax.tree.leaves(output)]
+
         # One more than the number of elements: an index beyond the end has a separate meaning.
         options = range(max(inputs[0].shape, default=0) + 1)
-        for option in itertools.product(options, repeat=len(unknown)):
-            operands, matches = [value.copy() for value in labelled], []
-            for (k, index), choice in zip(unknown, option, strict=True):
-                operands[k][index] = choice
-                matches.append(self.each("eq", np.asarray(inputs[k][index], object), self.constants(choice)))
-            if equation.primitive.name == "scatter-add":
-                results = [self.summed_at(equation, inputs[0], operands[1], inputs[2])]
-            else:
-                # An index beyond the end gives -1, which is not a label.
-                parameters = equation.params | ({"fill_value": -1} if "fill_value" in equation.params else {})
-                output = equation.primitive.bind(*(operand.astype(int) for operand in operands), **parameters)
-                results = [pick(np.asarray(part)) for part in jax.tree.leaves(output)]
-            if values:
+        # The unknown indices on which each element depends: few of them where many places are read.
+        first, everything = at({}), frozenset(range(len(unknown)))
+        is_read = equation.primitive.name == "gather"
+        decided_by = [np.full(part.shape, frozenset() if is_read else everything, object) for part in first]
+        for number, option in itertools.product(everything if is_read else [], options):
+            for sets, part, other in zip(decided_by, first, at({number: option}), strict=True):
+                sets[part != other] = _map(lambda numbers, number=number: numbers | {number}, sets[part != other])
+        # A gather beyond the end fills with a number that is not a label.
+        pick = functools.partial(_map, lambda k: k if is_sum else pool[k] if 0 <= k < len(pool) else math.nan)
+        values = [pick(part) for part in first]
+        for numbers in {numbers for sets in decided_by for numbers in sets.flat if numbers}:
+            order = sorted(numbers)
+            for option in itertools.islice(itertools.product(options, repeat=len(order)), 1, None):
+                chosen = dict(zip(order, option, strict=True))
+                matches = [self.each("eq", names[number], self.constants(k)) for number, k in chosen.items()]
                 condition = functools.reduce(functools.partial(self.each, "and"), matches)
-                results = [self.each(CHOICE, condition, *pair) for pair in zip(values, results, strict=True)]
-            values = results
+                for value, sets, part in zip(values, decided_by, at(chosen), strict=True):
+                    here = sets == numbers
+                    value[here] = self.each(CHOICE, condition, value[here], pick(part[here]))
         return values
 
     def summed_at(self, equation: Equation, values: Value, indices: Value, updates: Value) -> Value:

@@ -44,6 +44,20 @@ def of_case(name, **options):
     return nonholonomic.sweep(case.system, case.start, case.t1, axes=axes, event=case.event, progress=False, **options)
 
 
+class Room(nonholonomic.AbstractMode):
+    """A ball between four walls, two of which it strikes at once if it starts on a diagonal."""
+
+    def field(self, t, s):
+        return jnp.array([s[2], s[3], 0.0, 0.0])
+
+    def margin(self, t, s):
+        return {"left": 1.0 + s[0], "down": 1.0 + s[1], "right": 1.0 - s[0], "up": 1.0 - s[1]}
+
+    def reset(self, t, s, exit):
+        is_side = exit["left"] | exit["right"]
+        return s * jnp.where(is_side, jnp.array([1.0, 1.0, -1.0, 1.0]), jnp.array([1.0, 1.0, 1.0, -1.0])), 0
+
+
 #: Tables: smooth tops with error bounds, the last of several crossings, two slopes; hops; a rigid body; rides; own systems with
 #: resets and constraints.
 TABLES = {
@@ -77,6 +91,14 @@ TABLES = {
     ),
     "ride": lambda **device: stroller.sweep(
         RIDER, START, 1.0, axes={"launch.speed": [1.0, 2.0]}, progress=False, **device
+    ),
+    "room": lambda **device: nonholonomic.sweep(
+        nonholonomic.Hybrid([Room()]),
+        [0.0, 0.1, 1.3, 0.7],
+        5.0,
+        axes={"start[1]": [0.0, 0.5]},
+        progress=False,
+        **device,
     ),
     "ball": lambda **device: of_case("modes", sensitivities=["restitution"], **device),
     "sleigh": lambda **device: of_case("mechanics", **device),

@@ -79,6 +79,9 @@ def array_work(x):
         x.at[jnp.array([0, 2, 0])].add(2.0 * x),
         x.at[indices + jnp.array([0, 1, 2])].add(2.0 * x),
         jax.lax.dynamic_slice(x, (indices,), (2,)),
+        jnp.take_along_axis(matrix, jnp.argmin(matrix, axis=0)[None], axis=0),
+        matrix[indices + jnp.arange(2), indices],
+        matrix.at[indices, indices + jnp.arange(2)].set(x[:2]),
     )
     outputs = (matrix @ x, matrix.T.ravel(), x @ x, jnp.prod(x), jnp.max(x), jnp.min(x), jnp.argmin(x), jnp.argmax(x))
     return (
@@ -175,6 +178,12 @@ def test_what_no_result_needs_is_left_out():
 def test_what_is_computed_twice_is_written_once():
     text = javascript("f", lambda x: jnp.exp(x[0]) + jnp.exp(x[0]) * x[1], jnp.asarray(X))
     assert text.count("Math.exp") == 1
+
+
+def test_the_choices_of_places_that_are_read_apart_do_not_multiply():
+    """Four of ten rows: 40 choices, and not 10 to the power of four."""
+    text = javascript("f", lambda x: jnp.take_along_axis(x, jnp.argmin(x, axis=0)[None], axis=0), jnp.zeros((10, 4)))
+    assert text.count("\n") < 1000
 
 
 def test_an_unknown_primitive_is_named():
