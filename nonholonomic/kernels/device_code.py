@@ -246,7 +246,7 @@ def _function(name: str, part: Part) -> str:
     return text.replace("DEVICE", "CALLED", 1) if is_called else text
 
 
-def _struct_of(name: str, facts: dict[str, Any], functions: list[str]) -> str:
+def _struct_of(name: str, facts: dict[str, int], functions: list[str]) -> str:
     """A type with constants and functions."""
     constants = [f"static constexpr int {fact} = {int(value)};" for fact, value in facts.items()]
     return "\n".join([f"struct {name} {{", *constants, *functions, "};", ""])

@@ -10,12 +10,12 @@ import itertools
 import json
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import ArrayLike, PyTree
 
 from ..compilation.components import AbstractScalarReader, rows_along
 from ..compilation.xla_cpu import Equation, Program, called_program, programs_of, traced
@@ -164,7 +164,7 @@ WRITTEN_OUT, MOST_STATEMENTS = 16, 4000
 LEAVES = "break"
 
 
-def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
+def javascript(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """A function in JavaScript, as `scalar_code` writes it.
 
     **Example:**
@@ -188,7 +188,7 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
     return scalar_code(JAVASCRIPT, name, function, *arguments)
 
 
-def scalar_code(notation: Notation, name: str, function: Callable[..., Any], *arguments: Any) -> str:
+def scalar_code(notation: Notation, name: str, function: Callable[..., PyTree], *arguments: PyTree) -> str:
     """A function as a program of scalars.
 
     **Arguments:**
@@ -224,7 +224,7 @@ def _map(function: Callable[..., Number], *values: Value) -> Value:
 class _Block(AbstractScalarReader):
     """Consecutive statements: each defines names, reads others, and has lines of text."""
 
-    def __init__(self, notation: Notation, names: Any, known: dict[str, str]):
+    def __init__(self, notation: Notation, names: Iterator[int], known: dict[str, str]):
         self.notation, self.names, self.known = notation, names, known
         self.statements: list[tuple[list[Number], set[str], list[str]]] = []
 
@@ -403,7 +403,9 @@ class _Block(AbstractScalarReader):
         """New names, one for each number in some values."""
         return [_map(lambda _: f"v{next(self.names)}", value) for value in values]
 
-    def while_(self, inputs: Values, cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: int) -> Values:
+    def while_(
+        self, inputs: Values, cond_jaxpr: Program, body_jaxpr: Program, cond_nconsts: int, body_nconsts: int
+    ) -> Values:
         of_cond, of_body = inputs[:cond_nconsts], inputs[cond_nconsts : cond_nconsts + body_nconsts]
 
         def step(block: "_Block", carry: Values) -> Values:
@@ -413,7 +415,7 @@ class _Block(AbstractScalarReader):
 
         return self.loop("while (true)", inputs[cond_nconsts + body_nconsts :], step)
 
-    def scan_(self, inputs: Values, jaxpr: Any, length: int, reverse: bool, **counts: Any) -> Values:
+    def scan_(self, inputs: Values, jaxpr: Program, length: int, reverse: bool, **counts: Any) -> Values:
         first, count = counts.get("num_consts", 0), counts.get("num_carry", 0)
         if "ft_in" in counts:  # jax 0.11 and later
             first, count, _ = map(len, counts["ft_in"].unpack())
@@ -422,7 +424,7 @@ class _Block(AbstractScalarReader):
         if not rows and len(jaxpr.outvars) == count and not unrolled:
             head = f"for ({self.notation.counter} = 0; k < {length}; k++)"
             return self.loop(head, carry, lambda block, carry: block.read(jaxpr, [*constants, *carry]))
-        rows_of_steps: list[Any] = [None] * length
+        rows_of_steps: list[Values] = [[]] * length
         for k in reversed(range(length)) if reverse else range(length):
             new_values = self.read(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
             carry, rows_of_steps[k] = new_values[:count], new_values[count:]
@@ -450,7 +452,7 @@ def _flat(values: Sequence[Value]) -> list[Number]:
     return [number for value in values for number in value.ravel()]
 
 
-def _statements(jaxpr: Any) -> int:
+def _statements(jaxpr: Program) -> int:
     """About how many statements a jaxpr takes: one for each number that it computes."""
     total = 0
     for equation in jaxpr.eqns:
