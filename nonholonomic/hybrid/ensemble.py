@@ -244,12 +244,15 @@ def mode_numbered(modes: Sequence[Mode], numbers: Sequence[int], selected: Int[A
 
 # The rounds.
 
-#: Largest number of rounds, and so of modes in a run; then unfinished cells end as `UNRESOLVED`.
-MOST_ROUNDS = 2000
+#: Largest number of rounds, and so of modes in a run; then unfinished cells end as `UNRESOLVED`. So do cells with this many
+#: modes in a row that last no longer than this fraction of the time so far: where a ball comes to rest in infinitely many
+#: bounces, the round-off of its height leaves bounces of 1e-8 s.
+MOST_ROUNDS, MOST_STALLED, STALLED = 2000, 100, 1e-7
 
 
 class HybridOutcome(NamedTuple, Generic[Numbers]):
-    """How every cell ended, as in `integration.Outcome`, with the mode in which it ended, and the counters.
+    """How every cell ended, as in `integration.Outcome`, with the mode in which it ended, the number of modes just before the
+    end that took hardly any time, and the counters.
 
     **Example:** as for `solve_hybrid`.
 
@@ -266,6 +269,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
     rejected: Int[Numbers, " cells"]
     extremes: Float[Numbers, "3 cells"]
     mode: Int[Numbers, " cells"]
+    stalled: Int[Numbers, " cells"]
     counts: Int[Numbers, "counters cells"]
 
 
@@ -296,6 +300,7 @@ def at_start(
         rejected=zeros,
         extremes=xp.tile(xp.asarray(NO_EXTREMES)[:, None], len(mode)),
         mode=mode,
+        stalled=zeros,
         counts=xp.zeros((counters, len(mode)), int),
     )
 
@@ -385,8 +390,10 @@ def after_solve(
     shortest = (xp.where(is_least, *pair) for pair in zip((least, start_time + place), runs.extremes[:2], strict=True))
     # A cell that enters a mode beyond the event passed the event earlier, unless it started there.
     has_event = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(runs.crossing_time))
+    stalled = xp.where(outcome.end_time <= STALLED * start_time, runs.stalled + 1, 0)
+    is_stuck = (outcome.status == LEFT_DOMAIN) & (stalled >= MOST_STALLED)
     return HybridOutcome(
-        status=outcome.status,
+        status=xp.where(is_stuck, UNRESOLVED, outcome.status),
         crossing_time=xp.where(has_event, start_time + outcome.crossing_time, runs.crossing_time),
         end_time=xp.where(outcome.status == REACHED_END, t1, start_time + outcome.end_time),
         state=outcome.state,
@@ -394,6 +401,7 @@ def after_solve(
         rejected=runs.rejected + outcome.rejected,
         extremes=xp.stack([*shortest, xp.maximum(longest, runs.extremes[2])]),
         mode=runs.mode,
+        stalled=stalled,
         counts=runs.counts,
     )
 

@@ -153,7 +153,7 @@ def outcome_of(samples: SampledRun) -> HybridOutcome[Array]:
     counts = jnp.zeros((0, len(mode)), int) if counts is None else counts.astype(int).T
     ending = (jnp.full_like(samples.end_time, jnp.inf), samples.end_time, samples.end_state.T)
     extremes = jax.lax.stop_gradient(samples.extremes).T
-    return HybridOutcome(status, *ending, steps, rejected, extremes, mode, counts)
+    return HybridOutcome(status, *ending, steps, rejected, extremes, mode, jnp.zeros_like(status), counts)
 
 
 @eqx.filter_jit

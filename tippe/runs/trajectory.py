@@ -331,7 +331,7 @@ def _along(model: Any, path: DenseSolution | HybridPath, tolerance: Number) -> A
     one, none = np.ones(1), np.zeros(1, int)
     state, inf = np.asarray(state)[:, None], np.inf * one
     outcome = HybridOutcome(
-        none + path.status, inf, one, state, none, none, np.stack([inf, one, one]), none + last_mode, none[None]
+        none + path.status, inf, one, state, none, none, np.stack([inf, one, one]), none + last_mode, none, none[None]
     )
     (ended,) = np.asarray(eqx.filter_jit(model.ended)(jax.tree.map(jnp.asarray, outcome), jnp.asarray(tolerance)))
     status = Status(int(ended)).word
