@@ -46,7 +46,8 @@ class Verdict(NamedTuple):
     - `agree`, `starts`: number of refined candidates that reached the best minimum, and number of all.
     - `undetermined`: the parameters that the data do not determine, in words.
     - `concerns`: the concerns, in words; empty for a flawless fit.
-    - `notes`: what is special about the likelihood, in words; errors and intervals take account of it.
+    - `notes`: what is special about the likelihood, in words; errors and intervals take account of it. If `p_value` is NaN, the
+      first one says why.
     - `effective`, `k`: effective number of draws behind errors and intervals, and the shape of the tail of their weights
       (Pareto k-hat): below 0.7, they can be trusted.
     - `minima`: the minima that the data allow, as `Minimum`, the most probable first.
@@ -72,6 +73,8 @@ class Verdict(NamedTuple):
         """Whether to believe the fit, and what to do; `Identification.details` has the statistics."""
         if self.concerns:
             return f"do not rely on this fit yet: {'; '.join(self.concerns)}"
+        if math.isnan(self.p_value):
+            return f"no concerns, but {self.notes[0]}"
         return "no concerns about this fit" + (
             f", {counted(len(self.notes), 'note')} in its details" if self.notes else ""
         )
@@ -107,6 +110,10 @@ def judge(
     is_outside = np.abs(distribution.estimate - region.middle) > region.half_width
     outside = ", ".join(np.array(explorer.density.problem.names)[is_outside])
     fixed = " and ".join(getattr(explorer.density.problem.model, "fixed", ()))
+    untested = "no measurement is left to test this fit"
+    if np.any(measurements.estimated):
+        untested = "nothing tests this fit, as its errors come from its own residuals: pass `error`"
+    untested += f"; held fixed as if exact: {fixed}" if fixed else ""
     fixed += ", held fixed, may be wrong (free them, with priors), " if fixed else ""
     impossible, share = without_prediction(explorer, sample, distribution)
     minima, concerns, notes = (), (), ()
@@ -143,6 +150,7 @@ def judge(
     )
     notes = (
         *sentences(
+            (math.isnan(p_value), untested),
             (
                 outside,
                 f"{outside}: outside of the range in which minima were searched, so better ones may be missing; start closer, "

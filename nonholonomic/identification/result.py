@@ -285,15 +285,10 @@ class Identification:
     def details(self) -> str:
         """The statistics behind the verdict, estimates with standard errors, the combinations of parameters that the data
         determine, and the residuals."""
-        verdict, count = self.verdict, self.verdict.starts
-        scatter = f"residuals this large have a probability of {verdict.p_value:.2g}"
-        if math.isnan(verdict.p_value):
-            scatter = (
-                "residuals cannot test the fit: the errors were estimated from it, or no degree of freedom is left"
-            )
+        verdict, p_value, count = self.verdict, self.verdict.p_value, self.verdict.starts
         lines = [
             f"-2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
-            scatter,
+            *([] if math.isnan(p_value) else [f"residuals this large have a probability of {p_value:.2g}"]),
             *(f"{order.runs} runs of {order.count} signs (p = {order.p_value:.2g})" for order in verdict.series),
             f"{verdict.agree} of {count} refined candidates ended at the best minimum"
             + (", the others fit worse or were stopped early" if verdict.agree < count else ""),
