@@ -385,9 +385,12 @@ class Bound(NamedTuple):
             raise ValueError(f"{name} = {shown(value)} is not a number{hint}")
         # JAX transformations rebuild pytrees with placeholders, but constructors must not receive any.
         try:
-            numbers = np.asarray(value, dtype=float)
+            numbers = np.asarray(value)
+            if numbers.dtype.kind in "US":
+                raise TypeError
+            numbers = numbers.astype(float)
         except (TypeError, ValueError):
-            raise ValueError(f"{name} = {shown(value)} is not a number") from None
+            raise ValueError(f"{name} = {shown(value)} is not a number, or a list of numbers") from None
         except OverflowError:
             raise ValueError(f"{name} is an integer beyond 1.8e308 and must be finite") from None
         remark = f" ({self.why})" if self.why else ""

@@ -108,6 +108,11 @@ REFUSED = {
         "theta = 200 deg at 0.2 s (sample 2) must be, with room for its errors, between 0 and 180 deg",
     ),
     "a decimal comma": (lambda: tippe.Launch("6,5", 155.0), "theta = '6,5' is not a number: did you mean 6.5?"),
+    "numbers as texts": (
+        lambda: tippe.inversion_table(TOP, theta=["3", "6"], spin=155.0, t1=1.0),
+        "theta = ['3', '6'] is not a number, or a list of numbers",
+    ),
+    "a law as the surface": (lambda: tippe.Scene(TOP.body, tippe.Viscous(0.3)), "pass a law by its name, friction="),
     "a number as a text": (lambda: tippe.simulate(TOP, LAUNCH, "8"), "t1 = '8' is not a number: did you mean 8?"),
     "degrees of a box": (
         lambda: stroller.Box((1.0, 0.3), (0.5, 0.25), 45.0),
@@ -539,6 +544,14 @@ CALLED = {
         "explore takes scene, launch, path, sliders, t1, unit, label; spin = 155.0 is not among them; a launch has it: "
         "launch=tippe.Launch(theta, spin), or launch=tippe.Launch.degrees(theta, rpm)",
     ),
+    "units of a launch": (
+        lambda: tippe.Launch(6.0, 30.0, units="degrees"),
+        "units = 'degrees' is not among them; Launch.degrees(theta=6, rpm=1800) takes degrees",
+    ),
+    "friction of a table": (
+        lambda: tippe.inversion_table(TOP, theta=0.1, spin=155.0, friction=[0.1, 0.2], t1=1.0),
+        "friction = [0.1, 0.2] is not among them; a scene has the law; mu takes coefficients",
+    ),
     "a height for a place": (
         lambda: tippe.Launch(0.1, 155.0, height=0.01),
         "a launch touches the arena; place= states",
@@ -605,8 +618,8 @@ def test_a_message_names_the_argument_its_value_and_the_likely_fix(name):
 
 def test_a_fit_knows_which_numbers_of_the_launch_are_held_fixed():
     data = tippe.Recording(LAUNCH, [0.1, 0.2], [0.1, 0.1], 0.01)
-    assert tippe.log_density(TOP, data, {"mu": 0.3}).problem.model.fixed == ("launch.theta", "launch.spin")
-    free = {"mu": 0.3, "launch.spin": 155.0}
+    assert tippe.log_density(TOP, data, {"mu": 0.3}).problem.model.fixed == ("launch.theta", "launch.spin", "t0")
+    free = {"mu": 0.3, "launch.spin": 155.0, "t0": 0.0}
     assert tippe.log_density(TOP, data, free).problem.model.fixed == ("launch.theta",)
 
 

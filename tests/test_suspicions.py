@@ -73,7 +73,8 @@ SUSPECTED = {
     ),
     "a density in g/cm^3": (
         lambda: tippe.Top.turned(0.02, 0.7, cut=0.015, stem_radius=0.005, stem_length=0.012),
-        "density = 0.7 kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? 0.7 g/cm^3 are 700 kg/m^3",
+        "density = 0.7 kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? 0.7 g/cm^3 are 700 kg/m^3"
+        "; if it is the mass, pass mass=0.7",
     ),
     "a cylinder in mm": (
         lambda: tippe.Scene(rutstam_top(), tippe.Cylinder(300.0)),
@@ -170,7 +171,7 @@ SUSPECTED = {
     ),
     "turns a second of a top with a stem": (
         lambda: tippe.inversion_table(tippe.presets.classroom(), theta=0.1, spin=20.0, t1=1.0),
-        "spin = 20 rad/s is slow: this top needs about 34 rad/s to turn over; was it in turns a second?",
+        "spin = 20 rad/s is slow: this top needs about 44.5 rad/s to turn over; was it in turns a second?",
     ),
     "exactly upright": (
         lambda: tippe.inversion_time(TOP, tippe.Launch(0.0, 155.0), 1.0),

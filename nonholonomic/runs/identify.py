@@ -285,7 +285,7 @@ class DataModel(eqx.Module):
     """Predictions of several sets of data of a system, in the form that `nonholonomic.identification.result` expects.
 
     `seen`: indices of the predictions that were measured; `fixed`: the numbers of the first start that are neither zero nor
-    among the unknowns.
+    among the unknowns, and the clock of recordings if it is not.
     """
 
     data: tuple[Source, ...]
@@ -584,6 +584,8 @@ def posterior_of_runs(
     first, own = sources[0].model, set(map(own_name, unknowns))
     starts = [name for name in first.known if name.startswith(("launch.", "start")) and name not in own]
     fixed = tuple(name for name in starts if np.ndim(first.value(name)) == 0 and np.any(first.value(name)))
+    if "t0" not in own and any(isinstance(source, AbstractRecording) for source in several):
+        fixed += ("t0",)
     model = DataModel(sources, seen, Settings(tolerance, max_steps=MOST_STEPS), fixed)
     if priors is not None and not isinstance(priors, dict):
         raise ValueError(

@@ -164,7 +164,8 @@ class Table(eqx.Module):
         and the other variables are repeated. Each component of a vector is a column, such as "position.x".
         `attrs["units"]` contains the units.
 
-        **Arguments:** `unit`: as for `plot`, such as ("deg", "rpm"); by default SI units.
+        **Arguments:** `unit`: as for `plot`, such as ("deg", "rpm"); by default those of the launch, SI units for a plain
+        `Launch`. Columns in other units have them in their names, such as "theta [deg]", as `read_recording` expects.
 
         **Raises:** `ModuleNotFoundError`, with the command that installs it, if pandas is missing; `ValueError` for an unknown
         unit.
@@ -186,8 +187,7 @@ class Table(eqx.Module):
         import pandas
 
         require_unit(unit)
-        if unit:
-            return self.drawn_in(unit, *self.variables).to_dataframe()
+        table = self.drawn_in(unit := unit or self.unit, *self.variables)
         inner = dict.fromkeys(dim for dims in self.inner.values() for dim in dims)
         component_dims = {dim for dim in inner if np.asarray(self.coords[dim]).dtype.kind == "U"}
         dims = [*axes_of(self.coords, self.inner), *(dim for dim in inner if dim not in component_dims)]
@@ -198,8 +198,8 @@ class Table(eqx.Module):
             expanded = np.expand_dims(values, [k for k, dim in enumerate(dims) if dim not in own_dims])
             return np.broadcast_to(expanded, shape).reshape(-1)
 
-        columns, units = {dim: column(self.coords[dim], (dim,)) for dim in dims}, dict(self.units)
-        for name, whole in self.variables.items():
+        columns, units = {dim: column(table.coords[dim], (dim,)) for dim in dims}, dict(table.units)
+        for name, whole in table.variables.items():
             own_dims = self.dims(name)
             components = [dim for dim in own_dims if dim in component_dims]
             for index in np.ndindex(*(len(self.coords[dim]) for dim in components)):
@@ -210,7 +210,9 @@ class Table(eqx.Module):
                 if name in units:
                     units[column_name] = units[name]
         frame = pandas.DataFrame(columns)
-        frame.attrs["units"] = {name: unit for name, unit in units.items() if name in columns}
+        frame.attrs["units"] = {name: units[name] for name in columns if name in units}
+        if unit:
+            frame.columns = [f"{name} [{units[name]}]" if units.get(name, "1") != "1" else name for name in columns]
         return frame
 
     def save(self, path: object) -> None:
@@ -554,7 +556,7 @@ class Tabular(Viewable, abc.ABC):
     def to_dataframe(self, unit: str | Sequence[str] | None = None) -> "pandas.DataFrame":
         """The run as a `pandas.DataFrame` (needs pandas): a row for each time, a column for each quantity or component.
 
-        **Arguments:** `unit`: as for `plot`, such as ("deg", "rpm"); by default SI units.
+        **Arguments:** `unit`: as for `Table.to_dataframe`.
 
         **Raises:** `ValueError` for a batch of runs, and for an unknown unit.
         """
@@ -664,6 +666,11 @@ class Tabular(Viewable, abc.ABC):
             return self[name]
         methods = [method for method in dir(type(self)) if not method.startswith("_")]
         hint = "; did you mean 't'?" if name in ("time", "times") else likely(name, [*readable, *methods]) or "."
+        hint = (
+            "; files of other programs come from to_dataframe(), as to_dataframe().to_csv(path)."
+            if name == "to_csv"
+            else hint
+        )
         raise AttributeError(f"the run has no {name!r}{hint} It has {', '.join(['t', *readable])}")
 
     def __repr__(self) -> str:

@@ -151,13 +151,20 @@ def test_a_top_is_turned_from_its_mass_its_radius_and_its_stem(stem_radius, hole
 )
 def test_a_shape_that_cannot_be_turned_is_answered_by_three_digits_with_which_it_can(change):
     shape = SHAPE | change
-    with pytest.raises(ValueError, match=r"; \w+ = [\d.]+ would do$") as caught:
+    with pytest.raises(ValueError, match=r"[;:] \w+ = [\d.]+ would do$") as caught:
         tippe.Top.turned(density=700.0, **shape)
     message = str(caught.value)
     assert not re.search(r"\d\.\d{7}", message)
-    name, number = re.search(r"; (\w+) = ([\d.]+) would do$", message).groups()
+    name, number = re.search(r"[;:] (\w+) = ([\d.]+) would do$", message).groups()
     assert len(number.lstrip("0.")) <= 3
     tippe.Top.turned(density=700.0, **shape | {name: float(number)})
+
+
+def test_a_length_that_was_assumed_is_the_first_to_be_doubted():
+    with pytest.raises(
+        ValueError, match=r"^stem_length = 0.012 must .*; cut was assumed, measure it: cut = 0.0159 would do"
+    ):
+        tippe.Top.turned(radius=0.019, mass=0.018, stem_radius=0.003, stem_length=0.012)
 
 
 def test_a_shape_that_no_single_length_mends_is_refused_without_advice():

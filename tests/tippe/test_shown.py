@@ -147,6 +147,9 @@ def test_a_run_tells_whether_the_top_turned_over(run):
         tippe.Scene(group_I, friction=tippe.Viscous(0.3)), tippe.Launch(0.1, 155.0), 1.0, tolerance=1e-6
     )
     assert "not turned over: a top of group I (tippe.steady.group) cannot" in str(upright)
+    slow, still = (tippe.simulate(run.scene, tippe.Launch(theta, 20.0), 1.0, tolerance=1e-6) for theta in (0.1, 0.0))
+    assert "not turned over: below 27.65 rad/s, it is stable upright" in str(slow)
+    assert "not turned over: it starts exactly upright" in str(still)
     sliding = tippe.simulate(tippe.Scene(rutstam_top()), tippe.Launch(0.1, 155.0), 0.1, tolerance=1e-6)
     assert "not turned over: without friction no top turns over" in str(sliding)
 
@@ -163,15 +166,21 @@ def test_one_time_is_a_time(run):
     assert run.at(0.5).position.shape == (1, 3)
 
 
-def test_a_run_goes_to_pandas(run):
+def test_a_run_goes_to_pandas(run, tmp_path):
     frame = run.to_dataframe()
     assert_close(frame["position.x"], run.position[:, 0])
     assert frame.attrs["units"]["theta"] == "rad"
     in_degrees = run.to_dataframe(unit=("deg", "rpm"))
-    assert_close(in_degrees["theta"], np.degrees(run.theta), rtol=1e-12)
-    assert_close(in_degrees["spin"], np.asarray(run.spin) * 30.0 / np.pi, rtol=1e-12)
-    assert_close(in_degrees["position.x"], frame["position.x"])
+    assert_close(in_degrees["theta [deg]"], np.degrees(run.theta), rtol=1e-12)
+    assert_close(in_degrees["spin [rpm]"], np.asarray(run.spin) * 30.0 / np.pi, rtol=1e-12)
+    assert_close(in_degrees["position.x [m]"], frame["position.x"])
     assert (in_degrees.attrs["units"]["theta"], in_degrees.attrs["units"]["spin"]) == ("deg", "rpm")
+    # Back again, by a file; a launch in degrees needs no other words.
+    stated = dataclasses.replace(run, launch=tippe.Launch.degrees(theta=5.0, rpm=1500.0)).to_dataframe()
+    assert stated.equals(in_degrees)
+    stated[["time [s]", "theta [deg]"]].to_csv(tmp_path / "run.csv", index=False)
+    recording = tippe.read_recording(tmp_path / "run.csv", launch=run.launch)
+    assert_close(np.ravel(recording.value), run.theta, rtol=1e-12)
     with pytest.raises(ValueError, match="unit = 'degree celsius' must be one of"):
         run.to_dataframe(unit="degree celsius")
     with pytest.raises(
@@ -180,6 +189,8 @@ def test_a_run_goes_to_pandas(run):
         _ = run.to_datafrme
     with pytest.raises(AttributeError, match=re.escape("no 'xqxqx'. It has t, theta, eta")):
         _ = run.xqxqx
+    with pytest.raises(AttributeError, match="no 'to_csv'; files of other programs come from to_dataframe()"):
+        _ = run.to_csv
 
 
 def test_quantities_are_drawn_over_time_by_name_and_in_degrees(run):

@@ -185,13 +185,15 @@ def _remedy(lengths: dict[str, Any], message: str) -> str:
     if any(not isinstance(number, jax.Array) or is_traced(number) or number.ndim for number in numbers.values()):
         return message
     names = ("stem_length", "cut", "hole_radius", "hole_depth", "stem_radius")
-    for name in sorted(names, key=lambda name: not message.startswith(name)):
+    assumed = [name for name in ASSUMED if lengths[name] is None]
+    for name in sorted(names, key=lambda name: (name not in assumed, not message.startswith(name))):
         start = abs(float(numbers[name])) or float(numbers["radius"])
         for power in (sign * k for k in range(50) for sign in (1, -1)):
             number = f"{start * 1.03**power:.3g}"
             with contextlib.suppress(ValueError):
                 _turned(lengths | {name: float(number)}, np)
-                return f"{message}; {name} = {number} would do"
+                measure = f"{name} was assumed, measure it: " if name in assumed else ""
+                return f"{message}; {measure}{name} = {number} would do"
     return message
 
 
@@ -348,7 +350,7 @@ class Top(AbstractBody):
             min_density = float(np.min(density))
             warn(
                 f"density = {min_density:g} kg/m^3 is less than that of balsa wood, 100 kg/m^3: was it in g/cm^3? "
-                f"{min_density:g} g/cm^3 are {1e3 * min_density:g} kg/m^3"
+                f"{min_density:g} g/cm^3 are {1e3 * min_density:g} kg/m^3; if it is the mass, pass mass={min_density:g}"
             )
         lengths = {"radius": radius, "cut": cut, "stem_radius": stem_radius, "stem_length": stem_length}
         lengths |= {"hole_radius": hole_radius, "hole_depth": hole_depth}

@@ -89,6 +89,7 @@ class Launch(Stated, Bounded):
     units: ClassVar[dict[str, str]] = {"theta": "rad", "spin": "rad s-1", "eta": "rad", "azimuth": "rad"}
     units |= {"place": "m or rad", "velocity": "m s-1", "angular_velocity": "rad s-1"}
     advice: ClassVar[dict[str, str]] = dict.fromkeys(("spin", "rpm", "omega"), SPINS) | {"height": HEIGHT}
+    advice |= dict.fromkeys(("unit", "units"), "Launch.degrees(theta=6, rpm=1800) takes degrees and turns a minute")
 
     theta: Float[Array, "..."] = eqx.field(converter=as_number, metadata=INCLINATION)
     spin: Float[Array, "..."] = eqx.field(converter=as_number, metadata=SPIN)
@@ -239,7 +240,10 @@ class Scene(Bounded, Generic[Body]):
         if not isinstance(body, AbstractBody | AbstractRigidBody):
             kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{likely_fix(body)}"
             raise ValueError(f"body = {shown(body)} must be {kinds}")
-        validation.require_kind(surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
+        law = "; pass a law by its name, friction=" if isinstance(surface, AbstractFriction) else ""
+        validation.require_kind(
+            surface, "surface", AbstractSurface, f", such as tippe.Plane() or tippe.Cylinder(0.3){law}"
+        )
         validation.require_kind(friction, "friction", AbstractFriction, A_LAW)
         # This raises an error if the surface has no such side.
         surface.sign(self.side, "inside")

@@ -45,7 +45,8 @@ IN_A_LAUNCH = "a launch has it: launch=tippe.Launch(theta, spin), or launch=tipp
 def of_launches(function: Function) -> Function:
     """Let a function of launches name its arguments where it is called with others, and say how a launch is made."""
     names = ("theta", "spin", "eta", "azimuth", "degrees")
-    return explaining(function, {name: IN_A_LAUNCH for name in names} | {"rpm": SPINS, "omega": SPINS})
+    advice = {name: IN_A_LAUNCH for name in names} | {"rpm": SPINS, "omega": SPINS}
+    return explaining(function, advice | {"friction": "a scene has the law; mu takes coefficients"})
 
 
 def modes_of(

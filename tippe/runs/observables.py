@@ -30,7 +30,7 @@ from ..model.rigid import AbstractRigidBody
 from ..model.scene import Launch, Scene
 from ..modes.problems import INVERTED
 from ..presets import TOPS
-from ..steady import group
+from ..steady import group, upright_critical_spin
 
 # The quantities of a run of a tippe top, with units and names, and the table of a run.
 
@@ -363,8 +363,17 @@ class AbstractTrajectory(AbstractRun):
         reason = ""
         if isinstance(self.scene.friction, Frictionless):
             reason = ": without friction no top turns over"
-        elif self.scene.level and isinstance(body, Top) and group(body) == "I":
-            reason = ": a top of group I (tippe.steady.group) cannot"
+        elif self.scene.level and isinstance(body, Top):
+            critical = float(upright_critical_spin(self.scene))
+            if group(body) == "I":
+                reason = ": a top of group I (tippe.steady.group) cannot"
+            elif float(self.theta[0]) == 0.0:
+                reason = ": it starts exactly upright"
+            elif abs(float(self.spin[0])) < critical:
+                unit, factor = in_unit("rad/s", unit_of(self))
+                reason = (
+                    f": below {factor * critical:.4g} {unit}, it is stable upright (tippe.steady.upright_critical_spin)"
+                )
         return f"not turned over{reason}"
 
     def in_words(self) -> str:

@@ -86,12 +86,14 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: obj
     if isinstance(scene.body, AbstractRigidBody) or is_traced(theta) or is_traced(limit):
         return
     if np.any(np.asarray(theta) >= np.min(limit)):
-        start = np.max(np.asarray(theta))
+        unit, factor = in_unit("rad", unit_of(launch))
+        start, least_angle = factor * float(np.max(np.asarray(theta))), factor * float(np.min(limit))
         on_stem = angle is None and scene.has_stem
         reached = "the angle at which the stem touches a level plane" if on_stem else "the angle to be reached"
         warn(
-            f"theta = {start:g} rad is not below {reached}, {float(np.min(limit)):.4g} rad: the top "
-            f"{'stands on its stem' if on_stem else 'is inverted'} from the start{IN_DEGREES.format(f'{start:g}')}"
+            f"theta = {start:g} {unit} is not below {reached}, {least_angle:.4g} {unit}: the top "
+            f"{'stands on its stem' if on_stem else 'is inverted'} from the start"
+            f"{IN_DEGREES.format(f'{start:g}') if unit == 'rad' else ''}"
         )
     is_at_rest = launch.velocity is None and launch.angular_velocity is None
     if scene.level and is_at_rest and np.any(np.asarray(theta) == 0.0):
@@ -105,13 +107,16 @@ def warn_if_slow(scene: Scene, launch: Launch, theta: ArrayLike, spin: object, l
     at_rest = launch.velocity is None and launch.angular_velocity is None
     if not isinstance(scene.body, Top) or not at_rest or is_traced((scene, theta, spin, limit)):
         return
-    # The spin of which Jellett's constant is that of the tumbling top at the angle (`steady.tumbling`).
+    # The spin of which Jellett's constant is that of the tumbling top (`steady.tumbling`), the greatest on the way from the
+    # start to the angle: from the upright position on, it is `steady.upright_critical_spin`.
     body, fastest = scene.body, float(np.max(np.abs(np.asarray(spin))))
     mass, R, a, I1, I3 = (float(getattr(body, name)) for name in body.units)
     end, start = (float(np.cos(np.min(inclination))) for inclination in (limit, theta))
     if abs(I1 - I3) * R < I3 * a and start * R > a and fastest <= MOST_TURNS:
-        precession = math.sqrt(mass * float(scene.gravity) * a / (I3 * (a / R - end) + I1 * end))
-        slowest = R * (I1 * (1.0 - end**2) + I3 * (end - a / R) ** 2) * precession / (I3 * (R * start - a))
+        cosine = np.linspace(min(end, start), start, 100)
+        precession = np.sqrt(mass * float(scene.gravity) * a / (I3 * (a / R - cosine) + I1 * cosine))
+        momentum = R * (I1 * (1.0 - cosine**2) + I3 * (cosine - a / R) ** 2) * precession
+        slowest = float(np.max(momentum)) / (I3 * (R * start - a))
         unit, factor = in_unit("rad/s", unit_of(launch))
         number, turns = factor * fastest, 2.0 * math.pi * factor
         for other, size in {"rad/s": factor, "turns a second": turns}.items():
