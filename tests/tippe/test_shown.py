@@ -189,7 +189,7 @@ def test_a_run_goes_to_pandas(run, tmp_path):
         _ = run.to_datafrme
     with pytest.raises(AttributeError, match=re.escape("no 'xqxqx'. It has t, theta, eta")):
         _ = run.xqxqx
-    with pytest.raises(AttributeError, match="no 'to_csv'; files of other programs come from to_dataframe()"):
+    with pytest.raises(AttributeError, match="no 'to_csv'; files of other programs come from to_dataframe"):
         _ = run.to_csv
 
 
