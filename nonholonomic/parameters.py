@@ -7,9 +7,13 @@ all modes that have it.
 """
 
 import dataclasses
+import functools
 import math
 import re
+import sys
+import sysconfig
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from types import CellType, CodeType, FunctionType
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -20,7 +24,7 @@ from jax.tree_util import DictKey
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .compilation.components import Held
-from .text import Numbers, Stated, gathered, likely, name_of, spread, unit_of
+from .text import OWN, Numbers, Stated, gathered, likely, name_of, spread, unit_of
 
 #: The values of a parameter along an axis of a grid.
 Axis = TypeVar("Axis")
@@ -245,12 +249,13 @@ class TreeForm:
     """A tree without its numbers, which are listed one by one, in order within each array.
 
     - `structure`: structure of the tree; `leaves`: its leaves, with `None` for each array of numbers.
-    - `kinds`: shape and type of each array of numbers.
+    - `kinds`: shape and type of each array of numbers; `outside`: what the functions of the tree read from `outside` of it.
     """
 
     structure: Any
     leaves: tuple[Hashable, ...]
     kinds: tuple[tuple[tuple[int, ...], np.dtype], ...]
+    outside: Hashable = None
 
     @classmethod
     def of(cls, tree: PyTree) -> tuple["TreeForm", tuple[Array, ...]]:
@@ -259,7 +264,8 @@ class TreeForm:
         # With the type stated, one program serves Python's numbers and arrays.
         arrays = [jnp.asarray(leaf, jnp.result_type(leaf)) for leaf in leaves if is_number(leaf)]
         static_leaves = tuple(None if is_number(leaf) else leaf for leaf in leaves)
-        return cls(structure, static_leaves, tuple((array.shape, array.dtype) for array in arrays)), spread(arrays)
+        kinds = tuple((array.shape, array.dtype) for array in arrays)
+        return cls(structure, static_leaves, kinds, outside(tree, set())), spread(arrays)
 
     def tree(self, numbers: Sequence[Array]) -> PyTree:
         """The tree with the given numbers, each a scalar."""
@@ -270,6 +276,63 @@ class TreeForm:
     def types(self) -> tuple[jax.ShapeDtypeStruct, ...]:
         """The types of the numbers."""
         return tuple(jax.ShapeDtypeStruct((), kind) for shape, kind in self.kinds for _ in range(math.prod(shape)))
+
+
+def outside(value: Any, seen: set[int]) -> Hashable:
+    """What a user's functions and classes read from elsewhere: numbers, texts and arrays of their module, of closures, defaults
+    and class attributes. If one of them changes, other programs are needed.
+
+    **Arguments:** `value`: a function, a class, a module of Equinox, a container of such, or anything else; `seen`: what was
+    read before.
+    """
+    if isinstance(value, bool | int | float | complex | str):
+        return type(value), value
+    if isinstance(value, np.ndarray | jax.Array) and not isinstance(value, jax.core.Tracer):
+        array = np.asarray(value)
+        return array.shape, array.dtype.str, array.tobytes() if array.dtype != object else id(value)
+    if id(value) in seen:
+        return None
+    seen.add(id(value))
+    # Of properties, class methods and Equinox's methods.
+    inner = [getattr(value, name, None) for name in ("__func__", "fget", "method", "__wrapped__")]
+    parts: list[Any] = [part for part in inner if isinstance(part, FunctionType)]
+    if isinstance(value, dict | list | tuple):
+        parts = list(value.values() if isinstance(value, dict) else value)
+    elif isinstance(value, functools.partial):
+        parts = [value.func, value.args, value.keywords]
+    elif isinstance(value, eqx.Module):
+        fields = (getattr(value, field.name, None) for field in dataclasses.fields(value))
+        parts = [
+            type(value),
+            *(part for part in fields if not eqx.is_array(part) and not isinstance(part, float | int)),
+        ]
+    elif not _is_library(getattr(value, "__module__", None)):
+        if isinstance(value, type):
+            parts = [*value.__bases__, *vars(value).values()]
+        elif isinstance(value, FunctionType):
+            known, cells = value.__globals__, [cell for cell in value.__closure__ or () if cell != CellType()]
+            parts = [known[name] for name in sorted(names_in(value.__code__)) if name in known]
+            parts += [*(cell.cell_contents for cell in cells), value.__defaults__]
+    return tuple(outside(part, seen) for part in parts)
+
+
+def names_in(code: CodeType) -> set[str]:
+    """The names that a function and the functions inside it use."""
+    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*map(names_in, inner))
+
+
+@functools.lru_cache
+def _is_library(module: str | None) -> bool:
+    """Whether a module is installed, or part of Python or of these packages, and so does not change."""
+    file = str(getattr(sys.modules.get(module or "builtins"), "__file__", None) or "")
+    is_builtin = module in (None, "builtins") or module in sys.builtin_module_names
+    return (
+        is_builtin
+        or "site-packages" in file
+        or file.startswith(sysconfig.get_path("stdlib"))
+        or module.partition(".")[0] in OWN
+    )
 
 
 class Parameters(eqx.Module):

@@ -76,7 +76,8 @@ def named_errors(function: str, arguments: str) -> Iterator[None]:
 def with_own_numbers(event: Function, *args: PyTree) -> Function:
     """The event itself or, if it closes over traced numbers (such as those of an enclosing `jax.grad`), a module that
     contains these numbers. An event without numbers of its own has `TracedFunction`s in place of its functions."""
-    closed, shape = jax.make_jaxpr(event, return_shape=True)(*args)
+    # A new function, because JAX would not look again at what one that it knows closes over.
+    closed, shape = jax.make_jaxpr(lambda *args: event(*args), return_shape=True)(*args)
     if any(is_traced(const) for const in closed.consts):
         program = with_constants_first(closed)
 

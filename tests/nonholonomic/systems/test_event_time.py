@@ -127,6 +127,32 @@ def test_a_new_but_equal_event_compiles_nothing_again():
     assert_close(time(0.25), jnp.log(4.0), rtol=1e-10)
 
 
+def test_what_functions_read_from_outside_may_change():
+    """An element of a closure's array, an attribute of a class, and a default, read through a method."""
+    levels = np.array([0.5])
+
+    class Slowed(AbstractMode):
+        pace = 2.0
+
+        def slowed(self, y, by=(1.0,)):
+            return y * self.pace / by[0]
+
+        def field(self, t, y):
+            return -self.slowed(y)
+
+    def time(event=lambda t, y: y[0] - levels[0]):
+        return event_time(Hybrid([Slowed()]), jnp.ones(1), 9.0, event)
+
+    assert_close(time(), np.log(2.0) / 2.0, rtol=1e-10)
+    levels[0] = 0.25
+    assert_close(time(), np.log(4.0) / 2.0, rtol=1e-10)
+    Slowed.pace = 4.0
+    assert_close(time(), np.log(4.0) / 4.0, rtol=1e-10)
+    Slowed.slowed.__defaults__ = ((0.5,),)
+    assert_close(time(), np.log(4.0) / 8.0, rtol=1e-10)
+    assert compilations(time) == 0
+
+
 def test_a_smooth_system_has_second_derivatives():
     """t = ln(1 / level) / rate: first and second derivatives by both."""
     point = (jnp.asarray(2.0), jnp.asarray(0.5))

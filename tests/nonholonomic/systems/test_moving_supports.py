@@ -435,6 +435,10 @@ WRONG = {
         lambda: replaced(Sleigh, drift=lambda self, t, q: jnp.ones(1)),
         r"rate = .* violates the constraints by 1; constraints\(q\) @ rate must be drift\(t, q\)",
     ),
+    "a force of one component": (
+        lambda: replaced(Sleigh, force=lambda self, t, q, rate: -rate[:1]),
+        r"^force\(t, q, rate\) must be of shape \(3,\), not \(1,\)",
+    ),
     "a drift that is not a number": (
         lambda: replaced(Sleigh, drift=lambda self, t, q: jnp.full(1, jnp.nan)),
         r"^drift\(t, q\) = \[nan\] at the start must be finite",
