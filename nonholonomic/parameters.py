@@ -25,6 +25,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .compilation.components import Held
 from .text import OWN, Numbers, Stated, gathered, likely, name_of, spread, unit_of
+from .validation import is_traced
 
 #: The values of a parameter along an axis of a grid.
 Axis = TypeVar("Axis")
@@ -287,7 +288,7 @@ def outside(value: Any, seen: set[int]) -> Hashable:
     """
     if isinstance(value, bool | int | float | complex | str):
         return type(value), value
-    if isinstance(value, np.ndarray | jax.Array) and not isinstance(value, jax.core.Tracer):
+    if isinstance(value, np.ndarray | jax.Array) and not is_traced(value):
         array = np.asarray(value)
         return array.shape, array.dtype.str, array.tobytes() if array.dtype != object else id(value)
     if id(value) in seen:
@@ -325,14 +326,10 @@ def names_in(code: CodeType) -> set[str]:
 @functools.lru_cache
 def _is_library(module: str | None) -> bool:
     """Whether a module is installed, or part of Python or of these packages, and so does not change."""
-    file = str(getattr(sys.modules.get(module or "builtins"), "__file__", None) or "")
-    is_builtin = module in (None, "builtins") or module in sys.builtin_module_names
-    return (
-        is_builtin
-        or "site-packages" in file
-        or file.startswith(sysconfig.get_path("stdlib"))
-        or module.partition(".")[0] in OWN
-    )
+    name = module or "builtins"
+    file = getattr(sys.modules.get(name), "__file__", None) or ""
+    is_installed = "site-packages" in file or file.startswith(sysconfig.get_path("stdlib"))
+    return is_installed or name in sys.builtin_module_names or name.partition(".")[0] in OWN
 
 
 class Parameters(eqx.Module):
