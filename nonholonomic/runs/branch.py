@@ -278,7 +278,7 @@ class Branch(eqx.Module):
         if kind == continuation.DOUBLING:
             values, vectors = np.linalg.eig(old.jacobian)
             aside = np.append(np.real(vectors[list(orbit.search.free), np.argmin(np.abs(values + 1.0))]), 0.0)
-            course = course._replace(returns=2 * course.returns)
+            once, course = course, course._replace(returns=2 * course.returns)
         else:
             # In the plane of both branches, across this one.
             place = [j for j, word in enumerate(self.kinds) if word != continuation.REGULAR][k]
@@ -290,9 +290,18 @@ class Branch(eqx.Module):
         reason = ""
         for distance in continuation.ASIDE:
             try:
-                return jax.tree.map(jnp.asarray, course.corrected(begin + distance * aside, aside).orbit)
+                point = course.corrected(begin + distance * aside, aside)
             except continuation.NoPoint as error:
                 reason = str(error)
+                continue
+            if kind == continuation.DOUBLING:
+                # Near the special point, a multiplier is near 1, and half of the returns lead to the other prong.
+                half = once.evaluated(point.unknowns)
+                is_near = np.min(np.abs(point.orbit.multipliers - 1.0)) < continuation.NEARLY_ONE
+                if not is_near or np.abs(half.state - half.start).max() < distance * course.scale:
+                    reason = "Newton's method leads to an orbit elsewhere"
+                    continue
+            return jax.tree.map(jnp.asarray, point.orbit)
         raise ValueError(f"no orbit of the other branch was found near {self.name} = {value:.10g}: {reason}")
 
     def to_table(self) -> Table:

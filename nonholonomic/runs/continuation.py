@@ -82,8 +82,9 @@ SAME_ORBIT = 1e-6
 #: A state this near the section, in units of the time of a return, is moved onto it.
 NEAR = 0.05
 
-#: The distances from a branch at which another branch is looked for, in units of the scale of the state.
-ASIDE = (1e-2, 3e-3, 1e-3)
+#: The distances from a branch at which another branch is looked for, in units of the scale of the state; and how near to 1 a
+#: multiplier of a doubled orbit is near its beginning.
+ASIDE, NEARLY_ONE = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4), 0.5
 
 
 class Returns(NamedTuple):

@@ -38,7 +38,8 @@ def fixed(growth, x, **numbers):
 
 
 def test_the_logistic_map_doubles_its_period(tmp_path):
-    """At 3, at 1 + sqrt(6), and at 3.5440903596 (OEIS A086181)."""
+    """At 3, at 1 + sqrt(6), and at 3.5440903596 (OEIS A086181) and on: a switch leads to an orbit beside the doubling, not to one
+    farther away on the same branch."""
     branch = fixed(2.9, 0.6).branch("growth", 3.2)
     np.testing.assert_allclose(branch.states[:, 0], 1.0 - 1.0 / branch.values, atol=1e-11)
     np.testing.assert_allclose(branch.multipliers[:, 0].real, 2.0 - branch.values, atol=1e-9)
@@ -59,6 +60,10 @@ def test_the_logistic_map_doubles_its_period(tmp_path):
     np.testing.assert_allclose(doubled.special[0].value, 1.0 + np.sqrt(6.0), atol=1e-9)
     again = doubled.switched().branch("growth", 3.55)
     np.testing.assert_allclose(again.special[0].value, 3.5440903595519, atol=1e-8)
+    third = again.switched().branch("growth", 3.566)
+    np.testing.assert_allclose(third.values[0], 3.5440903595519, atol=2e-3)
+    np.testing.assert_allclose(third.special[0].value, 3.5644072660954, atol=1e-8)
+    assert third.switched().returns == 16
 
     kept = pickle.loads(pickle.dumps(branch))
     np.testing.assert_array_equal(kept.states, branch.states)
