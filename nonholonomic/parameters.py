@@ -13,7 +13,7 @@ import re
 import sys
 import sysconfig
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from types import CellType, CodeType, FunctionType
+from types import CellType, CodeType, FunctionType, MethodType
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -301,6 +301,8 @@ def outside(value: Any, seen: set[int]) -> Hashable:
         parts = list(value.values() if isinstance(value, dict) else value)
     elif isinstance(value, functools.partial):
         parts = [value.func, value.args, value.keywords]
+    elif isinstance(value, MethodType):
+        parts = [value.__func__, value.__self__]
     elif isinstance(value, eqx.Module):
         fields = (getattr(value, field.name, None) for field in dataclasses.fields(value))
         parts = [
@@ -314,6 +316,8 @@ def outside(value: Any, seen: set[int]) -> Hashable:
             known, cells = value.__globals__, [cell for cell in value.__closure__ or () if cell != CellType()]
             parts = [known[name] for name in sorted(names_in(value.__code__)) if name in known]
             parts += [*(cell.cell_contents for cell in cells), value.__defaults__]
+        elif callable(value) and not _is_library(type(value).__module__):
+            parts += [type(value), *vars(value).values()]
     return tuple(outside(part, seen) for part in parts)
 
 

@@ -23,9 +23,9 @@ from .runge_kutta import Integers, Lanes, Mask, States, Step, inverse_root
 #: removes this error from the times of events.
 LOCATED = 1e-10
 
-#: After this number of trials, the far end of the bracket counts as the event. This is a safety net: ten times as many
-#: trials change no bit of a result; with only six, the end of contact would err by 1e-8.
-MOST_TRIALS = 64
+#: After this number of trials, the far end of the bracket counts as the event. Zeros of smooth functions take up to eight.
+#: Those that take more than the second number jump or have kinks: every other trial then halves the bracket.
+MOST_TRIALS, HALVED_AFTER = 100, 12
 
 
 #: Places in a step, as fractions of it; margins there, of one event or of several.
@@ -82,6 +82,8 @@ def refine(
     rise = bracket.margin_high - bracket.margin_low
     guess = bracket.low - bracket.margin_low * (bracket.high - bracket.low) / jnp.where(rise == 0.0, 1.0, rise)
     guess = jnp.where(jnp.isfinite(guess), jnp.clip(guess, bracket.low, bracket.high), bracket.high)
+    is_halved = (bracket.trials > HALVED_AFTER) & (bracket.trials % 2 == 0)
+    guess = jnp.where(is_halved, 0.5 * (bracket.low + bracket.high), guess)
     resolution = max(LOCATED, 8.0 * float(jnp.finfo(margin.dtype).eps)) * bracket.stride
     is_exhausted = bracket.trials >= MOST_TRIALS
     close = bracketing & ((jnp.abs(guess - length) <= 2.0 * resolution) | is_exhausted)

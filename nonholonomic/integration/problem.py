@@ -344,10 +344,31 @@ def event_time(problem: AbstractProblem, function: Callable[[States], PyTree], t
     """
 
     field = traced_once(lambda point: problem.field(time, point), state)
-    first, second = jax.jvp(lambda point: jax.jvp(function, (point,), (field(point),))[1], (state,), (field(state),))
-    first = jnp.where(first == 0.0, 1.0, first)
-    shift = function(state) / first
-    return time_at_jump(problem, time, state, time - shift - 0.5 * second / first * shift * shift)
+    rate = field(state)
+    first, second = jax.jvp(lambda point: jax.jvp(function, (point,), (field(point),))[1], (state,), (rate,))
+    value, slope = function(state), jnp.where(first == 0.0, 1.0, first)
+    shift = value / slope
+    # A function that jumps through zero has no zero there, and does not say how the time of its jump varies.
+    left = function(state - shift * rate)
+    is_zero = (jnp.abs(shift) <= NEAR * time) | ((slope < 0.0) & (jnp.abs(left) <= 0.5 * jnp.abs(value)))
+    moved = time - jnp.where(is_zero, shift + 0.5 * second / slope * shift * shift, 0.0)
+    moved = moved + _of_slope(value, stop_gradient(jnp.where(is_zero, 0.0, jnp.nan)))
+    return time_at_jump(problem, time, state, moved)
+
+
+#: A located event this near to a zero, as a fraction of the time so far, is on it.
+NEAR = 1e-9
+
+
+@jax.custom_jvp
+def _of_slope(value: Lanes, slope: Lanes) -> Lanes:
+    """Zero, which varies with a value by the given slope."""
+    return jnp.zeros_like(value)
+
+
+@_of_slope.defjvp
+def _slope_of_zero(values: tuple[Lanes, Lanes], rates: tuple[Lanes, Lanes]) -> tuple[Lanes, Lanes]:
+    return jnp.zeros_like(values[0]), values[1] * rates[0]
 
 
 def time_at_jump(problem: AbstractProblem, time: Lanes, state: States, otherwise: Lanes) -> Lanes:

@@ -31,7 +31,8 @@ from .runge_kutta import (
     watched_places,
 )
 
-#: Steps are not cut below this fraction of the horizon because of a fast function, whose minimum may be zero.
+#: Steps are not cut below this fraction of the horizon, or of the time so far and a second, because of a fast function, whose
+#: minimum may be zero.
 SHORTEST_CUT = 1e-9
 
 #: Step-size control as in Diffrax's I controller with its defaults.
@@ -226,7 +227,7 @@ def before_jump(
     if fast_margins or fast_event:
         path = Path.of(lane_state.time, tried_length, start, trial.middle, (trial.state, trial.rate))
         checked = free & accurate
-        may_cut = checked & (tried_length > SHORTEST_CUT * control.t1)
+        may_cut = checked & (tried_length > SHORTEST_CUT * jnp.minimum(control.t1, lane_state.time + 1.0))
         place, longest = watched(problem, lane_state.side, path, checked, may_cut)
         negative = jnp.minimum(negative, place)
     crosses_inside = accurate & (negative < 1.0)

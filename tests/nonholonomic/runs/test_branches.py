@@ -38,8 +38,8 @@ def fixed(growth, x, **numbers):
 
 
 def test_the_logistic_map_doubles_its_period(tmp_path):
-    """At 3, at 1 + sqrt(6), and at 3.5440903596 (OEIS A086181) and on: a switch leads to an orbit beside the doubling, not to one
-    farther away on the same branch."""
+    """At 3, 1 + sqrt(6), 3.5440903596 (OEIS A086181) and so on: a switch leads to an orbit beside the doubling, not to
+    one farther away on the same branch."""
     branch = fixed(2.9, 0.6).branch("growth", 3.2)
     np.testing.assert_allclose(branch.states[:, 0], 1.0 - 1.0 / branch.values, atol=1e-11)
     np.testing.assert_allclose(branch.multipliers[:, 0].real, 2.0 - branch.values, atol=1e-9)
