@@ -98,6 +98,9 @@ class RideModel(AbstractSceneModel):
         numbers, is traced once.
         """
         is_module = isinstance(controls, eqx.Module)
+        if is_module:
+            # Another number compiles nothing again.
+            controls = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, controls)
         is_own = is_module and not (is_users(type(controls)) or inputs.has_arrays(controls))
         if not (controls is None or is_own or isinstance(controls, Held | Formula)):
             sizes = [np.size(leaf) for leaf in jax.tree.leaves(controls) if is_array(leaf)]
@@ -231,9 +234,7 @@ class RideModel(AbstractSceneModel):
         values = dict.fromkeys(["heading"], 0.0) | dict(zip(self.reduced_names, state, strict=True))
         place = tuple(values.get(name, 0.0) for name, _ in coordinates)
         launch = Launch(place, *(values[name] for name in OF_A_LAUNCH))
-        # The numbers of the input, too, may change.
-        controls = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, self.input)
-        return dataclasses.replace(self, launch=launch, input=controls)
+        return dataclasses.replace(self, launch=launch)
 
     def reduced(self, rows: Float[Array, "rows cells"], mode: object) -> Float[Array, "components cells"]:
         coordinates = self.scene.surface.coordinates

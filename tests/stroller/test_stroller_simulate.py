@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 
 import stroller
 from nonholonomic.integration import Settings, sample
@@ -32,6 +33,22 @@ LAUNCH = Launch((0.3, -0.6), 0.5, 1.5, 0.2, 0.1)
 
 def push(t, motion):
     return 2.0 * jnp.cos(t) + 0.5 * motion.speed, 0.1 * jnp.sin(2.0 * t) - 0.2 * motion.steering
+
+
+class Push(eqx.Module):
+    """A constant force, a plain number."""
+
+    force: float
+
+    def __call__(self, t, motion):
+        return self.force, 0.0 * t
+
+
+def test_another_number_of_an_input_compiles_nothing_again():
+    scene, launch = Scene(BODY), Launch((0.0, 0.0), 0.3, 2.0)
+    first = stroller.simulate(scene, launch, 1.0, Push(1.7))
+    np.testing.assert_allclose(first.speed[-1], 3.0, rtol=1e-9)
+    assert compilations(lambda: stroller.simulate(scene, launch, 1.0, Push(3.4))) == 0
 
 
 @pytest.fixture(scope="module")
