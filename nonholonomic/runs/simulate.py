@@ -204,8 +204,8 @@ def simulate(
     - `solver`: an explicit Runge-Kutta solver of Diffrax; for scenes as for `tippe.simulate` and `stroller.simulate`.
     - `adjoint`: for scenes, an adjoint method of Diffrax.
 
-    A run of your own system may have at most 2000 resets; then it ends as "unresolved". Inside transformations, samples after the
-    end of a run are NaN, and their derivatives 0, so that a loss can leave them out.
+    A run of your own system may have at most 2000 resets; then it ends as "unresolved". Inside transformations, samples after
+    the end of a run are NaN, and their derivatives 0, so that a loss can leave them out.
 
     **Returns:** a `tippe.Trajectory`, a `stroller.Trajectory` or, for your own system, a `nonholonomic.Trajectory`;
     `run[name]` is a quantity at the times, and `status` states how the run ended.
