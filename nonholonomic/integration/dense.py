@@ -334,12 +334,14 @@ def _first_losses(problem: AbstractProblem, solution: diffrax.Solution, t0: Time
     ends, _ = saved(solution)
     lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
     starts = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
+    lasts = jnp.repeat(jnp.where(jnp.isfinite(ends[1:]), ends[1:], starts), PARTS)
     # The parts of all steps are the lanes of one problem.
     length = jnp.repeat(lengths / PARTS, PARTS)
     time = jnp.repeat(starts, PARTS) + length * jnp.tile(jnp.arange(PARTS), len(starts))
 
     def states(place: float) -> Float[Array, "components parts"]:
-        return jax.vmap(solution.evaluate)(time + place * length).T
+        # Beyond the last step, by round-off, there is nothing.
+        return jax.vmap(solution.evaluate)(jnp.minimum(time + place * length, lasts)).T
 
     end = states(1.0)
     margins = jax.vmap(problem.margin_or_one, (0, 1))(time + length, end)

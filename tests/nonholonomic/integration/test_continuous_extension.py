@@ -9,7 +9,7 @@ import pytest
 from close import assert_close
 from tune_middle import errors, middle_weights
 
-from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, Stabilized8, solve_with_samples
+from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, Stabilized8, follow, solve_with_samples
 from nonholonomic.integration.runge_kutta import explicit_step, memory_for_stages
 from nonholonomic.integration.samples import StepEnd, continuous_extension, hermite_factors, second_derivative
 
@@ -148,3 +148,27 @@ def test_samples_have_derivatives_where_states_have():
     times = np.linspace(0.1, 3.0, 30)
     slopes = jax.jvp(lambda scale: sampled(Scaled(scale=scale), times)[1], (jnp.asarray(2.0),), (jnp.ones(()),))[1]
     assert_close(slopes[0, :, 0], np.exp(np.sin(times)), atol=1e-8)
+
+
+class Limited(AbstractProblem):
+    """y' = y cos(t) from y = 1, up to a level."""
+
+    level: jnp.ndarray
+
+    def start(self):
+        return jnp.ones(1) + 0.0 * self.level, jnp.ones(1)
+
+    def field(self, time, state):
+        return state * jnp.cos(time)
+
+    def domain_margin(self, time, state):
+        return self.level - state[0]
+
+
+def test_the_end_of_a_run_is_found_in_its_last_step_whatever_the_round_off():
+    """The parts of a step need not add up to the step: beyond it, there is no state."""
+    settings = Settings(1e-7, solver=diffrax.Tsit5())
+    for level in np.random.default_rng(3).uniform(2.0, 2.6, 200):
+        path = follow(Limited(jnp.asarray(level)), 2.0, settings)
+        assert path.left_domain
+        np.testing.assert_allclose(path.times[-1], np.arcsin(np.log(level)), rtol=1e-4)
