@@ -13,7 +13,7 @@ import re
 import sys
 import sysconfig
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from types import CellType, CodeType, FunctionType, MethodType
+from types import CellType, CodeType, FunctionType, MethodType, SimpleNamespace
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -309,14 +309,14 @@ def outside(value: Any, seen: set[int]) -> Hashable:
             type(value),
             *(part for part in fields if not eqx.is_array(part) and not isinstance(part, float | int)),
         ]
-    elif not _is_library(getattr(value, "__module__", None)):
+    elif isinstance(value, SimpleNamespace) or not _is_library(getattr(value, "__module__", None)):
         if isinstance(value, type):
             parts = [*value.__bases__, *vars(value).values()]
         elif isinstance(value, FunctionType):
             known, cells = value.__globals__, [cell for cell in value.__closure__ or () if cell != CellType()]
             parts = [known[name] for name in sorted(names_in(value.__code__)) if name in known]
             parts += [*(cell.cell_contents for cell in cells), value.__defaults__]
-        elif callable(value) and not _is_library(type(value).__module__):
+        elif hasattr(value, "__dict__"):
             parts += [type(value), *vars(value).values()]
     return tuple(outside(part, seen) for part in parts)
 

@@ -1,5 +1,7 @@
 """Event times of users' own systems against closed forms, with their derivatives."""
 
+import types
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -128,8 +130,8 @@ def test_a_new_but_equal_event_compiles_nothing_again():
 
 
 def test_what_functions_read_from_outside_may_change():
-    """An element of a closure's array, an attribute of a class, and a default, read through a method."""
-    levels = np.array([0.5])
+    """An element of a closure's array, an attribute of an object and of a class, and a default, read through a method."""
+    levels, settings = np.array([0.5]), types.SimpleNamespace(share=1.0)
 
     class Slowed(AbstractMode):
         pace = 2.0
@@ -138,7 +140,7 @@ def test_what_functions_read_from_outside_may_change():
             return y * self.pace / by[0]
 
         def field(self, t, y):
-            return -self.slowed(y)
+            return -settings.share * self.slowed(y)
 
     def time(event=lambda t, y: y[0] - levels[0]):
         return event_time(Hybrid([Slowed()]), jnp.ones(1), 9.0, event)
@@ -151,6 +153,8 @@ def test_what_functions_read_from_outside_may_change():
     Slowed.slowed.__defaults__ = ((0.5,),)
     assert_close(time(), np.log(4.0) / 8.0, rtol=1e-10)
     assert compilations(time) == 0
+    settings.share = 0.5
+    assert_close(time(), np.log(4.0) / 4.0, rtol=1e-10)
 
 
 def test_a_smooth_system_has_second_derivatives():
