@@ -72,7 +72,7 @@ def test_a_page_says_what_a_run_says_of_its_end(run):
     values = jnp.array([slider.value for slider in live.sliders])
     for time, words in ((0.0, "fell back"), (fallen, "its sphere touches again"), (run.t[-1], "")):
         end = run.at([time])
-        outcome = HybridOutcome(*[None] * 9)._replace(
+        outcome = HybridOutcome(*[None] * len(HybridOutcome._fields))._replace(
             state=jnp.concatenate([end.states, path]), mode=end.contact.astype(int)
         )
         assert AFTERWARDS[int(live.motion.outcome(values, outcome))] == AFTERWARDS[int(end.afterwards)] == words
