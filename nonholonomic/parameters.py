@@ -311,7 +311,8 @@ def outside(value: Any, seen: set[int]) -> Hashable:
         ]
     elif isinstance(value, SimpleNamespace) or not _is_library(getattr(value, "__module__", None)):
         if isinstance(value, type):
-            parts = [*value.__bases__, *vars(value).values()]
+            named = vars(value).items()
+            parts = [*value.__bases__, *(part for name, part in named if name == "__call__" or name[:2] != "__")]
         elif isinstance(value, FunctionType):
             known, cells = value.__globals__, [cell for cell in value.__closure__ or () if cell != CellType()]
             parts = [known[name] for name in sorted(names_in(value.__code__)) if name in known]
