@@ -12,7 +12,7 @@ import math
 import re
 import sys
 import sysconfig
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from types import CellType, CodeType, FunctionType, MethodType, SimpleNamespace
 from typing import Any, TypeVar
 
@@ -266,7 +266,7 @@ class TreeForm:
         arrays = [jnp.asarray(leaf, jnp.result_type(leaf)) for leaf in leaves if is_number(leaf)]
         static_leaves = tuple(None if is_number(leaf) else leaf for leaf in leaves)
         kinds = tuple((array.shape, array.dtype) for array in arrays)
-        return cls(structure, static_leaves, kinds, outside(tree, set())), spread(arrays)
+        return cls(structure, static_leaves, kinds, outside(functions_in(tree), set())), spread(arrays)
 
     def tree(self, numbers: Sequence[Array]) -> PyTree:
         """The tree with the given numbers, each a scalar."""
@@ -304,11 +304,7 @@ def outside(value: Any, seen: set[int]) -> Hashable:
     elif isinstance(value, MethodType):
         parts = [value.__func__, value.__self__]
     elif isinstance(value, eqx.Module):
-        fields = (getattr(value, field.name, None) for field in dataclasses.fields(value))
-        parts = [
-            type(value),
-            *(part for part in fields if not eqx.is_array(part) and not isinstance(part, float | int)),
-        ]
+        parts = [type(value), *functions_in([getattr(value, field.name, None) for field in dataclasses.fields(value)])]
     elif isinstance(value, SimpleNamespace) or not _is_library(getattr(value, "__module__", None)):
         if isinstance(value, type):
             named = vars(value).items()
@@ -320,6 +316,12 @@ def outside(value: Any, seen: set[int]) -> Hashable:
         elif hasattr(value, "__dict__"):
             parts += [type(value), *vars(value).values()]
     return tuple(outside(part, seen) for part in parts)
+
+
+def functions_in(tree: PyTree) -> tuple[Callable[..., Any] | eqx.Module, ...]:
+    """The functions and the modules of a tree, without its numbers."""
+    leaves = jax.tree.leaves(tree, is_leaf=lambda leaf: isinstance(leaf, eqx.Module))
+    return tuple(leaf for leaf in leaves if callable(leaf) or isinstance(leaf, eqx.Module))
 
 
 def names_in(code: CodeType) -> set[str]:

@@ -157,6 +157,22 @@ def test_what_functions_read_from_outside_may_change():
     assert_close(time(), np.log(4.0) / 4.0, rtol=1e-10)
 
 
+def test_other_numbers_of_a_start_or_a_tuple_compile_nothing_again():
+    class Mixed(AbstractMode):
+        rates: tuple[float, float]
+
+        def field(self, t, y):
+            return -(self.rates[0] + self.rates[1]) * y
+
+    def end(start, rates):
+        return simulate(Hybrid([Mixed(rates)]), start, 1.0, times=[1.0]).state[-1]
+
+    assert_close(end([1.0], (1.0, 2.0)), np.exp(-3.0), rtol=1e-8)
+    assert compilations(end, [2.0], (1.0, 2.0)) == 0
+    assert compilations(end, [2.0], (1.5, 2.5)) == 0
+    assert_close(end([2.0], (1.5, 2.5)), 2.0 * np.exp(-4.0), rtol=1e-8)
+
+
 def test_a_smooth_system_has_second_derivatives():
     """t = ln(1 / level) / rate: first and second derivatives by both."""
     point = (jnp.asarray(2.0), jnp.asarray(0.5))
