@@ -286,7 +286,7 @@ def outside(value: Any, seen: set[int]) -> Hashable:
     **Arguments:** `value`: a function, a class, a module of Equinox, a container of such, or anything else; `seen`: what was
     read before.
     """
-    if isinstance(value, bool | int | float | complex | str):
+    if isinstance(value, int | float | complex | str):
         return type(value), value
     if isinstance(value, np.ndarray | jax.Array) and not is_traced(value):
         array = np.asarray(value)

@@ -335,6 +335,10 @@ def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes
     return event_time(problem, problem.event_function, time, state)
 
 
+#: A located event this near to a zero, as a fraction of the time so far, is on it.
+NEAR = 1e-9
+
+
 def event_time(problem: AbstractProblem, function: Callable[[States], PyTree], time: Lanes, state: States) -> Lanes:
     """Time at which a function of the state vanishes along a motion, for a state close to the zero, to third order in
     the distance.
@@ -354,10 +358,6 @@ def event_time(problem: AbstractProblem, function: Callable[[States], PyTree], t
     moved = time - jnp.where(is_zero, shift + 0.5 * second / slope * shift * shift, 0.0)
     moved = moved + _of_slope(value, stop_gradient(jnp.where(is_zero, 0.0, jnp.nan)))
     return time_at_jump(problem, time, state, moved)
-
-
-#: A located event this near to a zero, as a fraction of the time so far, is on it.
-NEAR = 1e-9
 
 
 @jax.custom_jvp

@@ -362,8 +362,8 @@ class _Block(AbstractScalarReader):
                 matches = [self.each("eq", names[number], self.constants(k)) for number, k in chosen.items()]
                 condition = functools.reduce(functools.partial(self.each, "and"), matches)
                 for value, sets, part in zip(values, decided_by, at(chosen), strict=True):
-                    here = sets == numbers
-                    value[here] = self.each(CHOICE, condition, value[here], pick(part[here]))
+                    elements = sets == numbers
+                    value[elements] = self.each(CHOICE, condition, value[elements], pick(part[elements]))
         return values
 
     def summed_at(self, equation: Equation, values: Value, indices: Value, updates: Value) -> Value:
