@@ -7,13 +7,9 @@ all modes that have it.
 """
 
 import dataclasses
-import functools
 import math
 import re
-import sys
-import sysconfig
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from types import CellType, CodeType, FunctionType, MethodType, SimpleNamespace
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -23,9 +19,8 @@ import numpy as np
 from jax.tree_util import DictKey
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .compilation.components import Held
-from .text import OWN, Numbers, Stated, gathered, likely, name_of, spread, unit_of
-from .validation import is_traced
+from .compilation.components import Held, functions_in, outside
+from .text import Numbers, Stated, gathered, likely, name_of, spread, unit_of
 
 #: The values of a parameter along an axis of a grid.
 Axis = TypeVar("Axis")
@@ -277,66 +272,6 @@ class TreeForm:
     def types(self) -> tuple[jax.ShapeDtypeStruct, ...]:
         """The types of the numbers."""
         return tuple(jax.ShapeDtypeStruct((), kind) for shape, kind in self.kinds for _ in range(math.prod(shape)))
-
-
-def outside(value: Any, seen: set[int]) -> Hashable:
-    """What a user's functions and classes read from elsewhere: numbers, texts and arrays of their module, of closures, defaults
-    and class attributes. If one of them changes, other programs are needed.
-
-    **Arguments:** `value`: a function, a class, a module of Equinox, a container of such, or anything else; `seen`: what was
-    read before.
-    """
-    if isinstance(value, int | float | complex | str):
-        return type(value), value
-    if isinstance(value, np.ndarray | jax.Array) and not is_traced(value):
-        array = np.asarray(value)
-        return array.shape, array.dtype.str, array.tobytes() if array.dtype != object else id(value)
-    if id(value) in seen:
-        return None
-    seen.add(id(value))
-    # Of properties, class methods and Equinox's methods.
-    inner = [getattr(value, name, None) for name in ("__func__", "fget", "method", "__wrapped__")]
-    parts: list[Any] = [part for part in inner if isinstance(part, FunctionType)]
-    if isinstance(value, dict | list | tuple):
-        parts = list(value.values() if isinstance(value, dict) else value)
-    elif isinstance(value, functools.partial):
-        parts = [value.func, value.args, value.keywords]
-    elif isinstance(value, MethodType):
-        parts = [value.__func__, value.__self__]
-    elif isinstance(value, eqx.Module):
-        parts = [type(value), *functions_in([getattr(value, field.name, None) for field in dataclasses.fields(value)])]
-    elif isinstance(value, SimpleNamespace) or not _is_library(getattr(value, "__module__", None)):
-        if isinstance(value, type):
-            named = vars(value).items()
-            parts = [*value.__bases__, *(part for name, part in named if name == "__call__" or name[:2] != "__")]
-        elif isinstance(value, FunctionType):
-            known, cells = value.__globals__, [cell for cell in value.__closure__ or () if cell != CellType()]
-            parts = [known[name] for name in sorted(names_in(value.__code__)) if name in known]
-            parts += [*(cell.cell_contents for cell in cells), value.__defaults__]
-        elif hasattr(value, "__dict__"):
-            parts += [type(value), *vars(value).values()]
-    return tuple(outside(part, seen) for part in parts)
-
-
-def functions_in(tree: PyTree) -> tuple[Callable[..., Any] | eqx.Module, ...]:
-    """The functions and the modules of a tree, without its numbers."""
-    leaves = jax.tree.leaves(tree, is_leaf=lambda leaf: isinstance(leaf, eqx.Module))
-    return tuple(leaf for leaf in leaves if callable(leaf) or isinstance(leaf, eqx.Module))
-
-
-def names_in(code: CodeType) -> set[str]:
-    """The names that a function and the functions inside it use."""
-    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
-    return set(code.co_names).union(*map(names_in, inner))
-
-
-@functools.lru_cache
-def _is_library(module: str | None) -> bool:
-    """Whether a module is installed, or part of Python or of these packages, and so does not change."""
-    name = module or "builtins"
-    file = getattr(sys.modules.get(name), "__file__", None) or ""
-    is_installed = "site-packages" in file or file.startswith(sysconfig.get_path("stdlib"))
-    return is_installed or name in sys.builtin_module_names or name.partition(".")[0] in OWN
 
 
 class Parameters(eqx.Module):

@@ -8,10 +8,15 @@ that is not finite still makes a result NaN.
 
 import abc
 import contextlib
+import dataclasses
+import dis
 import functools
 import math
 import operator
+import sys
+import sysconfig
 from collections.abc import Callable, Hashable, Sequence
+from types import CellType, CodeType, FunctionType, MethodType, SimpleNamespace
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -20,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from ..text import is_array, is_numbers, is_users, joined, parted
+from ..text import OWN, is_array, is_numbers, is_users, joined, parted
 from ..validation import is_traced
 from .xla_cpu import Equation, Function, Program, bound, read_program, stored, traced
 
@@ -523,7 +528,14 @@ def held(value: Any, evaluate: Function) -> Any:
     **Arguments:** `evaluate`: evaluates the object for single numbers; if a result is an array, the object has one number
     per lane.
     """
-    if not is_users(type(value)) or not any(is_array(leaf) and leaf.ndim for leaf in jax.tree.leaves(value)):
+    kind: Any = type(value)
+    if not is_users(kind):
+        return value
+    # JAX knows programs by the class, which reads other numbers than before if these attributes differ.
+    before, kind.__outside__ = vars(kind).get("__outside__"), outside(kind, set())
+    if before not in (None, kind.__outside__):
+        jax.clear_caches()
+    if not any(is_array(leaf) and leaf.ndim for leaf in jax.tree.leaves(value)):
         return value
     try:
         results = jax.eval_shape(lambda: evaluate(value))
@@ -558,3 +570,69 @@ class Held(eqx.Module):
         if name.startswith("_") or name == "function":
             raise AttributeError(name)
         return getattr(self.whole, name)
+
+
+# What users' functions read from elsewhere, which JAX does not notice if it changes.
+
+
+def outside(value: Any, seen: set[int]) -> Hashable:
+    """What a user's functions and classes read from elsewhere: numbers, texts and arrays of their module, of closures, defaults
+    and class attributes. If one of them changes, other programs are needed.
+
+    **Arguments:** `value`: a function, a class, a module of Equinox, a container of such, or anything else; `seen`: what was
+    read before.
+    """
+    if isinstance(value, int | float | complex | str):
+        return type(value), value
+    if isinstance(value, np.ndarray | jax.Array) and not is_traced(value):
+        array = np.asarray(value)
+        return array.shape, array.dtype.str, array.tobytes() if array.dtype != object else id(value)
+    if id(value) in seen:
+        return None
+    seen.add(id(value))
+    # Of properties, class methods and Equinox's methods.
+    inner = [getattr(value, name, None) for name in ("__func__", "fget", "method", "__wrapped__")]
+    parts: list[Any] = [part for part in inner if isinstance(part, FunctionType)]
+    if isinstance(value, dict | list | tuple):
+        parts = list(value.values() if isinstance(value, dict) else value)
+    elif isinstance(value, functools.partial):
+        parts = [value.func, value.args, value.keywords]
+    elif isinstance(value, MethodType):
+        parts = [value.__func__, value.__self__]
+    elif isinstance(value, eqx.Module):
+        parts = [type(value), *functions_in([getattr(value, field.name, None) for field in dataclasses.fields(value)])]
+    elif isinstance(value, SimpleNamespace) or not _is_library(getattr(value, "__module__", None)):
+        if isinstance(value, type):
+            named = vars(value).items()
+            parts = [*value.__bases__, *(part for name, part in named if name == "__call__" or name[:2] != "__")]
+        elif isinstance(value, FunctionType):
+            known, cells = value.__globals__, [cell for cell in value.__closure__ or () if cell != CellType()]
+            parts = [known[name] for name in globals_in(value.__code__) if name in known]
+            parts += [*(cell.cell_contents for cell in cells), value.__defaults__]
+        elif hasattr(value, "__dict__"):
+            parts += [type(value), *vars(value).values()]
+    return tuple(outside(part, seen) for part in parts)
+
+
+def functions_in(tree: PyTree) -> tuple[Callable[..., Any] | eqx.Module, ...]:
+    """The functions and the modules of a tree, without its numbers."""
+    leaves = jax.tree.leaves(tree, is_leaf=lambda leaf: isinstance(leaf, eqx.Module))
+    return tuple(leaf for leaf in leaves if callable(leaf) or isinstance(leaf, eqx.Module))
+
+
+@functools.lru_cache(maxsize=1024)
+def globals_in(code: CodeType) -> tuple[str, ...]:
+    """The names that a function and the functions inside it look up in their module, in alphabetical order; an attribute of
+    the same name is none of them."""
+    inner = (name for constant in code.co_consts if isinstance(constant, CodeType) for name in globals_in(constant))
+    own = (part.argval for part in dis.get_instructions(code) if part.opname in ("LOAD_GLOBAL", "LOAD_NAME"))
+    return tuple(sorted({*inner, *own}))
+
+
+@functools.lru_cache
+def _is_library(module: str | None) -> bool:
+    """Whether a module is installed, or part of Python or of these packages, and so does not change."""
+    name = module or "builtins"
+    file = getattr(sys.modules.get(name), "__file__", None) or ""
+    is_installed = "site-packages" in file or file.startswith(sysconfig.get_path("stdlib"))
+    return is_installed or name in sys.builtin_module_names or name.partition(".")[0] in OWN

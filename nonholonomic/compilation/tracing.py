@@ -12,6 +12,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
+from ..text import name_of
 from ..validation import UNTRACEABLE, is_traced, warn
 from .components import BY_ELEMENT, over_cells, spelled_out
 from .xla_cpu import (
@@ -118,6 +119,16 @@ class TracedFunction:
     def __reduce__(self) -> tuple[Function, tuple[Function]]:
         # A program cannot be pickled, but the function may be.
         return _itself, (self.function,)
+
+
+class GivenFunction(TracedFunction):
+    """A traced function of one result that stays as it was when it was traced, whatever it reads from elsewhere."""
+
+    def __call__(self, *args: PyTree) -> PyTree:
+        return jaxpr_as_fun(self.program)(*jax.tree.leaves(args))[0]
+
+    def __repr__(self) -> str:
+        return f"<function {getattr(self.function, '__name__', name_of(self.function))}>"
 
 
 def _itself(function: Function) -> Function:

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compilation.components import Held
-from ..compilation.tracing import with_own_numbers
+from ..compilation.tracing import GivenFunction, with_own_numbers
 from ..text import parted, shown
 from ..validation import UNTRACEABLE, Bound, as_number, is_traced
 from .surface import DIVIDED, NEWTON_STEPS, OPEN, TINY, AbstractGradientSurface, AbstractSurface, BallGap, Place
@@ -32,7 +32,7 @@ from .vector import Component, Vector, difference, dot, scale, sum_vectors, tang
 
 
 class Plain(eqx.Module):
-    """A function without parameters; the same function gives the same program."""
+    """A function without parameters; equal functions give the same program."""
 
     function: Callable[..., Component] = eqx.field(static=True)
 
@@ -52,7 +52,8 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> Any:
         value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
     zeros = (jnp.zeros(()),) * len(arguments)
     try:
-        program = jax.make_jaxpr(value)(*zeros)
+        # A new function, because JAX would not look again at what one that it knows reads from elsewhere.
+        program = jax.make_jaxpr(lambda *numbers: value(*numbers))(*zeros)
     except jax.errors.JAXTypeError as error:
         raise ValueError(f"{name} = {shown(value)} {UNTRACEABLE}") from error
     except TypeError as error:
@@ -72,7 +73,7 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> Any:
     if any(is_traced(constant) for constant in program.consts):
         return Held(parted(with_own_numbers(value, *zeros)))
     # Equinox warns of the arrays of a tree, such as JAX's partial functions, but not of those of its method.
-    return Plain(value if jax.tree_util.all_leaves([value]) else value.__call__)
+    return Plain(GivenFunction(value if jax.tree_util.all_leaves([value]) else value.__call__, program))
 
 
 def _takes_lanes(function: Any, count: int) -> bool:

@@ -6,6 +6,7 @@ import difflib
 import functools
 import inspect
 from collections.abc import Callable, Sequence
+from types import CodeType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from ..compilation.components import spelled_out
 from ..compilation.tracing import dependent_outputs, is_elementary, jumps_of, named_errors, warn_of_unclear
 from ..compilation.xla_cpu import Function, equations_in, traced
-from ..parameters import TreeForm, names_in
+from ..parameters import TreeForm
 from ..text import counted, described, shown
 from ..validation import as_number, is_traced, require, warn
 from . import mechanics
@@ -460,7 +461,13 @@ def warn_of_misspelt_methods(part: AbstractMode | AbstractSystem, base: type) ->
     for name in methods:
         matches = difflib.get_close_matches(name, free, 1, SIMILARITY)
         others = (function for other, function in methods.items() if other != name)
-        if matches and not name.startswith("_") and not any(name in names_in(other.__code__) for other in others):
+        if matches and not name.startswith("_") and not any(name in _names_in(other.__code__) for other in others):
             warn(f"{kind.__name__}.{name} is never called; did you mean {matches[0]}?")
     if "reset" not in free and "margin" in free:
         warn(f"{kind.__name__}.reset is never called: write margin too, which falls to zero where the reset happens")
+
+
+def _names_in(code: CodeType) -> set[str]:
+    """The names that a function and the functions inside it use."""
+    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*map(_names_in, inner))

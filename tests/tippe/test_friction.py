@@ -1,5 +1,7 @@
 """Friction with a torque: the disc it stands for, its potential, its limits, and what the laws refuse."""
 
+import subprocess
+import sys
 import warnings
 
 import equinox as eqx
@@ -252,3 +254,31 @@ def test_a_law_that_drives_the_top_is_told_when_it_is_constructed():
         jax.jit(lambda torque: Sideways(torque).torque)(1.0)
         # Nor does a law that cannot be evaluated prevent its construction: the first run says what is wrong.
         type("Broken", (tippe.AbstractFriction,), {"per_normal_force": lambda self, slip: 1.0 / None})()
+
+
+#: A law that reads a number from its module, which changes between two scenes.
+CHANGED = """
+import jax, tippe
+from tippe.friction import ContactLoad, Slip
+
+top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+
+class Law(tippe.AbstractFriction):
+    def per_normal_force(self, slip):
+        return ContactLoad((-mu * slip.x, -mu * slip.y))
+
+@jax.jit
+def force(scene):
+    return scene.friction.per_normal_force(Slip(1.0, 0.0)).force[0]
+
+forces = []
+for mu in (0.25, 0.5, 0.5):
+    forces.append(float(force(tippe.Scene(top, friction=Law()))))
+print(forces)
+"""
+
+
+def test_a_new_scene_uses_the_numbers_that_its_law_reads_now():
+    """In a process of its own, because all programs are compiled again."""
+    done = subprocess.run([sys.executable, "-c", CHANGED], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[-0.25, -0.5, -0.5]"

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.compilation.components import over_lanes
-from nonholonomic.compilation.tracing import with_own_numbers
+from nonholonomic.compilation.tracing import GivenFunction, with_own_numbers
 from nonholonomic.compilation.xla_cpu import stored
 from nonholonomic.geometry import AbstractFrame, Component, FrameMotion, Place, PlaneFrame, Tangent, Vector
 from nonholonomic.geometry.vector import add, cross, dot, multiply, rate_in_frame, scale, subtract, sum_vectors
@@ -390,7 +390,7 @@ class RigidBody(AbstractRigidBody):
 
 
 class Plain(eqx.Module):
-    """A support function without parameters; the same function gives the same program."""
+    """A support function without parameters; equal functions give the same program."""
 
     function: Callable[..., Any] = eqx.field(static=True)
 
@@ -421,7 +421,9 @@ def as_support(value: Any) -> eqx.Module:
     if isinstance(value, eqx.Module):
         return value
     closed = with_own_numbers(value, direction)
-    return closed if isinstance(closed, eqx.Module) else Plain(value)
+    if isinstance(closed, eqx.Module):
+        return closed
+    return Plain(GivenFunction(value, jax.make_jaxpr(lambda direction: value(direction))(direction)))
 
 
 def evenly_spread(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

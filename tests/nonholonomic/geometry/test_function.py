@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import sys
 
 import equinox as eqx
 import jax
@@ -124,3 +125,24 @@ def test_runs_over_a_ground_with_arrays_are_those_over_the_same_ground_without(c
             ends[-1].append(float(table.theta[0]))
     assert_close(ends[0], np.full(len(ends[0]), 0.0857507), atol=1e-6)
     assert_close(ends[1], ends[0], rtol=1e-12)
+
+
+STEEPNESS = 0.5
+
+
+def hills(x, y):
+    return STEEPNESS * x * x + jnp.where(y > 0.0, 0.1, 0.2)
+
+
+def test_a_ground_keeps_the_numbers_that_its_function_read_when_it_was_made(monkeypatch):
+    """A new ground has the new numbers, also in a program that was compiled for the old ones; the old ground keeps its own."""
+    evaluated = jax.jit(lambda ground, x, y: ground.ground(x, y))
+    old = Graph(hills)
+    assert evaluated(old, 1.0, 1.0) == 0.6
+    monkeypatch.setattr(sys.modules[__name__], "STEEPNESS", 2.0)
+    new = Graph(hills)
+    assert evaluated(new, 1.0, 1.0) == 2.1
+    assert evaluated(old, 1.0, 1.0) == 0.6
+    assert old.ground(1.0, 1.0) == 0.6
+    assert pickle.loads(pickle.dumps(new)).ground(1.0, 1.0) == 2.1
+    assert repr(new) == "Graph(height=Plain(function=<function hills>))"

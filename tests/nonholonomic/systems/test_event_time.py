@@ -173,6 +173,26 @@ def test_other_numbers_of_a_start_or_a_tuple_compile_nothing_again():
     assert_close(end([2.0], (1.5, 2.5)), 2.0 * np.exp(-4.0), rtol=1e-8)
 
 
+pace = 1.0
+
+
+def test_a_name_of_an_attribute_is_no_number_from_outside(monkeypatch):
+    """In a loop over `pace`, the number of the mode of the same name changes alone."""
+
+    class Paced(AbstractMode):
+        pace: float
+
+        def field(self, t, y):
+            return -self.pace * y
+
+    def time(value):
+        monkeypatch.setitem(globals(), "pace", value)
+        return event_time(Hybrid([Paced(value)]), jnp.ones(1), 9.0, lambda t, y: y[0] - 0.5)
+
+    assert_close(time(1.0), np.log(2.0), rtol=1e-10)
+    assert compilations(time, 2.0) == 0
+
+
 def test_a_smooth_system_has_second_derivatives():
     """t = ln(1 / level) / rate: first and second derivatives by both."""
     point = (jnp.asarray(2.0), jnp.asarray(0.5))
