@@ -36,6 +36,9 @@ ELEMENTARY = f"""{BY_ELEMENT}
     slice split squeeze stack tile transpose unstack zeros_like
 """
 
+#: Operations that call another traced function.
+CALLS = ("closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "jit", "pjit")
+
 
 def is_elementary(function: Function, *args: PyTree) -> bool:
     """Whether a function and its derivatives consist of operations that fit a single kernel, with products of small matrices as
@@ -57,9 +60,12 @@ def dependent_outputs(function: Function, *args: PyTree, on_first_alone: bool = 
     """A mask of the function's results that depend on its arguments, or on the first one, a number, alone."""
     closed = jax.make_jaxpr(function)(*args)
     inputs = [k == 0 or not on_first_alone for k in range(len(closed.in_avals))]
-    return read_program(
-        closed, inputs, lambda equation, reached: [any(reached)] * len(equation.outvars), lambda _: False
-    )
+
+    def reached(equation: Equation, inputs: list[bool]) -> Sequence[bool] | Program:
+        inner = called_program(equation) if equation.primitive.name in CALLS else None
+        return [any(inputs)] * len(equation.outvars) if inner is None else inner
+
+    return read_program(closed, inputs, reached, lambda _: False)
 
 
 @contextlib.contextmanager
@@ -407,8 +413,7 @@ GROWING = """
 #: Other operations that grow (+) or fall (-) with each operand.
 MONOTONE = {"sub": "+-", "ge": "+-", "gt": "+-", "le": "-+", "lt": "-+", "neg": "-", "not": "-", "erfc": "-"}
 
-#: Operations that call another traced function; and operations that jump, from one whole number to another.
-CALLS = ("closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "jit", "pjit")
+#: Operations that jump, from one whole number to another.
 STEPPING = ["ceil", "convert_element_type", "floor", "round", "sign"]
 
 

@@ -209,3 +209,14 @@ def test_a_component_at_rest_has_its_tangent_integrated(names):
     expected = {"rest": -(1.0 - 1.0 / 500.0), "push": -1.0}
     for name, slope in zip(names, derivatives, strict=True):
         assert_close(slope, np.full(4, expected[name]), rtol=1e-8)
+
+
+def test_a_tangent_moves_only_what_depends_on_the_number_also_through_a_compiled_function():
+    """Otherwise runs carry variations of numbers that stay, and modes that share a number get different shapes of it."""
+
+    @jax.jit
+    def built(rate, start):
+        return {"doubled": 2.0 * rate, "kept": start}
+
+    (tangent,) = tangents_of(lambda rate: built(rate, jnp.ones(2)), (jnp.asarray(3.0),), [(jnp.asarray(3.0),)])
+    assert tangent == {"doubled": 6.0, "kept": None}
