@@ -40,7 +40,7 @@ MOST_LINES = 450
 MOST_FILES_OUTSIDE = 6
 
 #: The size of the three packages: it may shrink. Imports are a share of the lines of code.
-MOST = {"files": 117, "lines": 25_922, "functions": 2601, "Any": 502, "imports": 0.0848}
+MOST = {"files": 117, "lines": 25_943, "functions": 2605, "Any": 503, "imports": 0.0848}
 
 
 class Arrow(NamedTuple):
