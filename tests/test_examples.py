@@ -28,7 +28,7 @@ FINDS = {
     "posterior": r"4 chains of 500 draws, [3-9]\d % accepted(?s:.*)mu  0\.(2[6-9]|3[0-3])\d+ (?s:.*)100 % of the times lie",
     "cohens_figure": r"(?s)slip_speed = 0\.11\d,.*mu = 0\.3\d\d,.*known to 0\.\d+ %: .*known to \d+ %: ",
     "printed_numbers": r"(?s)top: 77\.18 27\.41\n.*known to 3\.9 %.*mu \+1 %: not at all.*top: 2\.077 55\.78 -11\.16",
-    "lost_numbers": r"(?s)likelihood 29\.59 at 11 degrees.*\n\[29\.592\d* 31\.242\d* 31\.238\d* 32\.285\d*\]",
+    "lost_numbers": r"(?s)29\.59 at the most likely values, 11 degrees.*\n\[29\.592\d* 31\.242\d* 31\.238\d* 32\.285\d*\]",
 }
 
 

@@ -34,7 +34,7 @@ def _against_reference(number: int, case: str, happens: str, bound: float) -> Ro
         friction = tippe.Coulomb(expected["mu"], expected["slip_speed"])
     top = leine_glocker_top() if expected["stem_radius"] else rutstam_top()
     scene = tippe.Scene(top, friction=friction, contact="hybrid", restitution=expected["restitution"])
-    arguments = {"theta": expected["theta"], "spin": expected["spin"], "t1": expected["t1"], "tolerance": 1e-11}
+    arguments = {"tolerance": 1e-11} | {name: expected[name] for name in ("theta", "spin", "t1", "angle")}
     run = timed(lambda: tippe.inversion_table(scene, **arguments), 1)
     table = run.result
     flights = int(table.hops)
@@ -87,7 +87,7 @@ def leaning_on_the_stem() -> Row:
     """A top too slow to rise rocks between sphere and stem, slides on both, and falls back onto its sphere."""
     expected = {name: float(value) for name, value in REFERENCE[9].items() if name != "status"}
     scene = tippe.Scene(leine_glocker_top(), friction=tippe.Coulomb(0.3, 0.05), contact="hybrid")
-    arguments = {"theta": 0.1, "spin": expected["spin"], "t1": expected["t1"], "tolerance": 1e-11}
+    arguments = {"theta": 0.1, "tolerance": 1e-11} | {name: expected[name] for name in ("spin", "t1", "angle")}
     run = timed(lambda: tippe.inversion_table(scene, **arguments), 1)
     table = run.result
     error = abs(float(table.end_theta) - expected["end_theta"])
