@@ -10,28 +10,28 @@ motion are not those of a top (`benchmarks/papers/tippe_audit.py`). The same lau
 import argparse
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import jax
 import numpy as np
 
 from nonholonomic import __version__, views
 from nonholonomic.compilation.cache import enable_compilation_cache
-from nonholonomic.compilation.xla_cpu import compiled_quickly
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.sweeps import Table
-from nonholonomic.terminal import Progress, status_line
+from nonholonomic.terminal import status_line
 from nonholonomic.validation import require_folder
-from nonholonomic.views.explore import Frame
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .model.body import Top
 from .model.scene import Launch, Scene
-from .runs.verbs import inversion_table, simulate
-from .runs.view import Panel, draw_launches, frames, stage
+from .runs.verbs import inversion_table, simulate, trajectory_table
+from .runs.view import MOST_FRAMES, TURN_PER_FRAME, Panel, draw_launches
+
+# Only for type checkers: matplotlib is optional.
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: The paper's units in SI.
 GRAM, CENTIMETRE = 1e-3, 1e-2
@@ -72,7 +72,7 @@ TABLE_3 = PrintedTable(math.pi / 2.0, 0.3, tuple(map(Row, THETAS, (23.0, 19.0, 2
 SURFACES = {"sphere RADIUS": Sphere, "spheroid EQUATORIAL POLAR": Spheroid, "torus RING TUBE": Torus}
 SURFACES |= {"paraboloid P": Paraboloid, "plane TILT": Plane}
 
-#: Times at which theta is drawn, and the tops on the page.
+#: Times at which theta is drawn.
 SAMPLES = 3000
 
 
@@ -240,39 +240,25 @@ def described(options: argparse.Namespace) -> list[str]:
     ]
 
 
-@compiled_quickly
-def moving(scene: Scene[Top], launches: Launch, times: np.ndarray, tolerance: Any) -> Frame:
-    """The drawn quantities of every launch at the given times, in one batched run."""
-    return jax.vmap(lambda launch: frames(simulate(scene, launch, times[-1], times, tolerance)))(launches)
-
-
-def drawn(options: argparse.Namespace, t1: float) -> tuple[np.ndarray, dict[str, Frame]]:
-    """The times of the plot, up to `t1` [s], and the drawn quantities of every launch in each arena.
-
-    All numbers are arrays: another Python number would compile a new program, so the picture and the page could not
-    share programs. The arenas' programs are compiled in parallel, because the compiler uses little more than one core.
-    """
-    arenas, times = arenas_of(options), np.linspace(0.0, t1, SAMPLES)
-    tolerance = np.asarray(options.tolerance)
-
-    def run(arena: Arena) -> Frame:
-        eta, theta = (values.ravel() for values in np.meshgrid(arena.etas or [0.0], options.theta, indexing="ij"))
-        launches = Launch(theta, np.full_like(theta, arena.spin), eta, np.zeros_like(theta))
-        return moving(arena.scene, launches, times, tolerance)
-
-    with Progress(len(arenas), "arena", "compiling the drawing"), ThreadPoolExecutor(2) as threads:
-        return times, dict(zip(arenas, threads.map(run, arenas.values()), strict=True))
-
-
-def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
+def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> "Figure":
     """theta(t) of every launch."""
-    times, runs = drawn(options, options.t1)
-    panels, thetas = [], np.asarray(options.theta)
+    times, thetas, panels = np.linspace(0.0, options.t1, SAMPLES), np.asarray(options.theta), []
     for file, arena in arenas_of(options).items():
+        sampled = trajectory_table(
+            arena.scene,
+            theta=thetas,
+            eta=arena.etas or 0.0,
+            spin=arena.spin,
+            times=times,
+            quantities=("theta",),
+            tolerance=options.tolerance,
+            progress=False,
+        )
         titles = [f"{arena.name}, η(0) = {eta:.4g}" for eta in arena.etas] or [arena.name]
-        angles = np.asarray(runs[file].curves[0]).reshape(len(titles), len(thetas), -1)
-        ends = by_arena[file].last_time.reshape(len(thetas), len(titles))
-        panels += [Panel(title, times, angles[i], thetas, ends[:, i]) for i, title in enumerate(titles)]
+        angles, ends = (
+            part.reshape(len(thetas), len(titles), -1) for part in (sampled.theta, by_arena[file].last_time)
+        )
+        panels += [Panel(title, times, angles[:, i], thetas, ends[:, i, 0]) for i, title in enumerate(titles)]
     return draw_launches(panels, options.angle, "Dots: above the dashed angle for good")
 
 
@@ -280,18 +266,17 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[vie
     """In both arenas, the most upright launch that turns over without losing contact, or else the first launch that
     turns over."""
     ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in by_arena.values()]).max(axis=0)
-    # In a longer run, the samples would be too far apart to follow the spin.
-    arenas = arenas_of(options)
-    step = SAMPLES / abs(arenas["plane"].spin)
-    tilt = np.where(ends + 0.5 <= step, options.theta, np.inf)
+    # In a longer run, the frames would be too far apart to follow the spin.
+    arenas = arenas_of(options).values()
+    longest = MOST_FRAMES * TURN_PER_FRAME / max(abs(arena.spin) for arena in arenas)
+    tilt = np.where(ends + 0.5 <= longest, options.theta, np.inf)
     row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
-    last = min(options.t1, step, float(ends[row]) + 0.5)
-    (times, runs), stages = drawn(options, last), []
-    for number, (file, arena) in enumerate(arenas.items()):
-        frames_of_row = jax.tree.map(lambda part: np.asarray(part)[row], runs[file])
-        name = f"{arena.name}, θ(0) = {options.theta[row]:.4g} rad"
-        stages.append(stage([(arena.scene, times, frames_of_row)], [number], [name]))
-    return stages
+    theta, last = options.theta[row], min(options.t1, longest, float(ends[row]) + 0.5)
+    first, *others = (
+        simulate(arena.scene, Launch(theta, arena.spin, *arena.etas[:1]), last, tolerance=options.tolerance)
+        for arena in arenas
+    )
+    return first.stages(others, label=[f"{arena.name}, θ(0) = {theta:.4g} rad" for arena in arenas])
 
 
 def write(options: argparse.Namespace) -> views.Outputs:

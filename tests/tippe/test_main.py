@@ -4,7 +4,6 @@ import argparse
 import dataclasses
 import json
 
-import jax
 import numpy as np
 import pytest
 import xarray
@@ -14,7 +13,7 @@ from nonholonomic.views.pages import NO_VIEW
 from tippe import __main__ as job
 from tippe.__main__ import main
 from tippe.modes.problems import INVERTED
-from tippe.paper import drawn, parser
+from tippe.paper import parser
 from tippe.runs.view import theta_over_time
 
 SMALL = ["--paper", "--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
@@ -162,20 +161,6 @@ def test_theta_over_time_is_that_of_the_run(rutstam_scene):
     theta = theta_over_time(scene, launch, times, 1e-9, ("launch.theta", "scene.friction.mu"))
     run = tippe.simulate(rutstam_scene, launch, 8.0, times=times)
     np.testing.assert_allclose(theta, run.theta, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_picture_and_page_share_their_programs(caplog):
-    """The page shows a shorter time, and other jobs have another tolerance; neither is compiled anew."""
-    drawn(parser().parse_args(SMALL[1:]), 12.0)
-    # For all threads, which `jax.log_compiles` is not.
-    jax.config.update("jax_log_compiles", True)
-    try:
-        times, runs = drawn(parser().parse_args([*SMALL[1:], "--tolerance", "1e-6"]), 2.0)
-    finally:
-        jax.config.update("jax_log_compiles", False)
-    assert runs["plane"].theta.shape == (2, len(times))
-    assert "Compiling" not in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -147,21 +147,13 @@ def show(scene: Scene, times: np.ndarray, frames: Frame[np.ndarray], number: int
 def _(
     run: AbstractTrajectory, runs: list[AbstractTrajectory], numbers: Sequence[int], names: Sequence[str]
 ) -> views.Stage:
-    return stage([(run.scene, *motion(run)) for run in runs], numbers, names)
+    times, drawn = zip(*map(motion, runs), strict=True)
+    scenes = [run.scene for run in runs]
+    shows = tuple(map(show, scenes, times, drawn, numbers, names))
+    return views.Stage("; ".join(names), arena_of(scenes[0], drawn, drawn[0].normal[0]), shows)
 
 
-def stage(
-    drawn: list[tuple[Scene, np.ndarray, Frame[np.ndarray]]], numbers: Sequence[int], names: Sequence[str]
-) -> views.Stage:
-    """The stage of runs on a common arena. **Arguments:** `drawn`: scene, times and drawn quantities of each run; the others
-    as for `views.stage_of`."""
-    scene, _, first = drawn[0]
-    ground = arena_of(scene, [frames for *_, frames in drawn], first.normal[0])
-    shows = tuple(show(*run, number, name) for run, number, name in zip(drawn, numbers, names, strict=True))
-    return views.Stage("; ".join(names), ground, shows)
-
-
-def arena_of(scene: Scene, runs: list[Frame[np.ndarray]], normal: np.ndarray, margin: float = 0.0) -> views.Arena:
+def arena_of(scene: Scene, runs: Sequence[Frame[np.ndarray]], normal: np.ndarray, margin: float = 0.0) -> views.Arena:
     """The part of the arena on which runs take place. **Arguments:** `margin`: its least width [m] beyond their contacts."""
     points, size = np.concatenate([frames.traces[0][0] for frames in runs]), float(scene.body.size)
     return views.arena(scene.surface, points, normal, max(margin, 4.0 * size), 2.5 * size)
