@@ -436,7 +436,7 @@ class _Series(NamedTuple):
     - `name`: their quantity with its unit, such as "1: theta [deg]", where the number is that of the data.
     - `has_time`: whether they are samples; `places`: their times [s], or else their numbers in the picture; `labels`.
     - `curve`: times and predictions, also between the samples, or `None`.
-    - `value`, `upper`, `errors`, `predicted`, `residuals`, `is_limit`: (n,).
+    - `rows`: the measurements, with the fields of a `ResidualRow`.
     """
 
     name: str
@@ -445,12 +445,7 @@ class _Series(NamedTuple):
     places: np.ndarray
     labels: list[str]
     curve: tuple[np.ndarray, ...] | None
-    value: np.ndarray
-    upper: np.ndarray
-    errors: np.ndarray
-    predicted: np.ndarray
-    residuals: np.ndarray
-    is_limit: np.ndarray
+    rows: np.ndarray
 
 
 def _series_of(fit: "Identification", labels: Sequence[str], unit: Unit) -> list[_Series]:
@@ -458,17 +453,15 @@ def _series_of(fit: "Identification", labels: Sequence[str], unit: Unit) -> list
     measurements, (times_of_curves, curves) = fit.density.measurements, fit.curves
     numbers, times = np.asarray(measurements.series), np.asarray(measurements.time)
     rows, units, factors = zip(*fit.rows_in(unit), strict=True)
-    factors = np.array(factors)
-    value, upper, errors, predicted, residuals, is_limit = (
-        np.array([getattr(row, name) for row in rows])
-        for name in ("value", "upper", "error", "prediction", "residual", "censored")
-    )
+    rows, factors, all_series, without_time = np.rec.fromrecords(rows, names=rows[0]._fields), np.array(factors), [], 0
     # Draw an angle on the same turn as its prediction.
-    turns = factors * np.asarray(measurements.whole_periods((predicted - value) / factors))
-    value, all_series, without_time = np.where(is_limit, value, value + turns), [], 0
+    turns = factors * np.asarray(measurements.whole_periods((rows["prediction"] - rows["value"]) / factors))
+    turns[rows["upper"] > rows["value"]] = 0.0
+    rows["value"] += turns
+    rows["upper"] += turns
     for number in np.unique(numbers):
         indices = np.flatnonzero(numbers == number)
-        quantity, has_name, _ = rows[indices[0]].label.partition("(")
+        quantity, has_name, _ = str(rows["label"][indices[0]]).partition("(")
         # A number in parentheses after a blank only tells equal launches apart.
         if not has_name or quantity.endswith(" "):
             quantity = "time" if units[indices[0]] in UNITS["s"] else "measured"
@@ -479,10 +472,9 @@ def _series_of(fit: "Identification", labels: Sequence[str], unit: Unit) -> list
             without_time += len(indices)
         elif len(curves):
             curve = tuple(part[:, indices].T.ravel() for part in (times_of_curves, factors * curves))
-        arrays = (part[indices] for part in (value, upper, errors, predicted, residuals, is_limit))
         name, colour = with_unit(quantity, units[indices[0]]), f"C{len(all_series)}"
         texts = [labels[i] for i in indices.tolist()]
-        all_series.append(_Series(name, colour, has_time, places, texts, curve, *arrays))
+        all_series.append(_Series(name, colour, has_time, places, texts, curve, rows[indices]))
     return all_series
 
 
@@ -536,7 +528,7 @@ def _draw_block(panels: dict[str, list[_Series]], figure: "Figure", place: "Subp
         axes.set_ylabel(name)
     residuals = figure.add_subplot(grid[len(panels)], sharex=first)
     for series in block:
-        residuals.plot(series.places, series.residuals, ".", color=series.colour)
+        residuals.plot(series.places, series.rows["residual"], ".", color=series.colour)
     residuals.axhspan(-1.96, 1.96, color="0.9", zorder=0)
     residuals.set_ylabel("residual\n[standard errors]")
     labels = [label for series in block for label in series.labels]
@@ -553,28 +545,27 @@ def _draw_data(axes: "Axes", panel: list[_Series]) -> None:
     """Draw the series of one panel with their predictions, as curves if they have times."""
     several = len(panel) > 1
     for series in panel:
-        exact = ~series.is_limit
-        places, text = series.places[exact], series.name if several else "measured"
-        axes.errorbar(places, series.value[exact], series.errors[exact], fmt=".", color=series.colour, label=text)
+        exact = series.rows["upper"] == series.rows["value"]
+        places, rows = series.places[exact], series.rows[exact]
+        text = series.name if several else "measured"
+        axes.errorbar(places, rows["value"], rows["error"], fmt=".", color=series.colour, label=text)
         if series.curve is not None:
             text = None if several else "predicted"
             axes.plot(*series.curve, color=series.colour, alpha=0.5, linewidth=1.2, label=text)
         else:
             text = "predicted" if series is panel[0] else None
-            axes.plot(places, series.predicted[exact], "x", color="0.3", label=text)
-    places, value, upper, errors, predicted, is_limit = (
-        np.concatenate([getattr(series, name) for series in panel])
-        for name in ("places", "value", "upper", "errors", "predicted", "is_limit")
-    )
+            axes.plot(places, rows["prediction"], "x", color="0.3", label=text)
+    places, rows = (np.concatenate([getattr(series, name) for series in panel]) for name in ("places", "rows"))
+    is_limit = rows["upper"] > rows["value"]
     if not np.all(is_limit):
         # The measured values set the range, and the predictions as far as they are no farther than these.
-        exact = ~is_limit
-        low, high = float(np.min((value - errors)[exact])), float(np.max((value + errors)[exact]))
-        near = predicted[exact & np.isfinite(predicted)]
+        exact = rows[~is_limit]
+        low, high = float(np.min(exact["value"] - exact["error"])), float(np.max(exact["value"] + exact["error"]))
+        near = exact["prediction"][np.isfinite(exact["prediction"])]
         near = np.clip(near, low - 0.5 * (high - low), high + 0.5 * (high - low))
         low, high = min([low, *near]), max([high, *near])
         axes.set_ylim(low - MARGIN * (high - low), high + MARGIN * (high - low))
-    _draw_limits(axes, places[is_limit], value[is_limit], upper[is_limit])
+    _draw_limits(axes, places[is_limit], rows["value"][is_limit], rows["upper"][is_limit])
     axes.legend(fontsize=8)
 
 
