@@ -15,7 +15,7 @@ At the end of the file are the rules by which a run may start.
 import abc
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -23,7 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..compilation.tracing import dependent_outputs
 from ..geometry import solve
@@ -38,11 +38,27 @@ Margin = Float[Array, "..."] | dict[str, Float[Array, ""]] | None
 Reset = tuple[State, Any] | None
 
 
+@jax.tree_util.register_pytree_node_class
+class Exit(dict[str, Bool[Array, ""]]):
+    """Which margin of a dict has fallen, by name. To compare it with a number or a name would be false without a word."""
+
+    def __eq__(self, other: object) -> bool:
+        name = next(iter(self))
+        raise ValueError(f"exit == {other}: exit is a dict that is true for the margin that fell; write exit[{name!r}]")
+
+    def tree_flatten(self) -> tuple[tuple[Array, ...], tuple[str, ...]]:
+        return tuple(self.values()), tuple(self)
+
+    @classmethod
+    def tree_unflatten(cls, names: tuple[str, ...], has_fallen: Sequence[Array]) -> "Exit":
+        return cls(zip(names, has_fallen, strict=True))
+
+
 def exit_of(margin: Any, number: ArrayLike) -> tuple[Any, ...]:
-    """The further argument of a reset after the margin of this index has fallen, if there are several: the index, or for a
-    dict whether it is the margin of each name."""
+    """The further argument of a reset after the margin of this index has fallen, if there are several: the index, or an
+    `Exit`."""
     if isinstance(margin, dict):
-        return ({name: jnp.asarray(number) == k for k, name in enumerate(margin)},)
+        return (Exit((name, jnp.asarray(number) == k) for k, name in enumerate(margin)),)
     return () if jnp.ndim(margin) == 0 else (jnp.asarray(number),)
 
 

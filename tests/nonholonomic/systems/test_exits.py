@@ -134,6 +134,17 @@ def test_wrong_margins_are_described(margin, message):
         event_time(Hybrid([type("Wrong", (Room,), {"margin": margin})()], lambda t, y: y[0]), STARTS[0], 1.0)
 
 
+@pytest.mark.parametrize("written", [0, "left"])
+def test_a_dict_of_exits_is_not_compared_with_a_number_or_a_name(written):
+    """`exit == "left"` would be false, and the reset another one than it says."""
+
+    def reset(self, t, q, rate, exit):
+        return jnp.where(exit == written, q, -q), rate
+
+    with pytest.raises(ValueError, match=r"exit == (0|left): .*write exit\['left'\]"):
+        simulate(type("Wrong", (Block,), {"reset": reset})(), ([0.0, 1.1, 0.1], [0.0, 0.0, 0.0]), 1.5)
+
+
 @pytest.mark.slow
 @needs_browser
 def test_the_browser_knows_the_wall():
