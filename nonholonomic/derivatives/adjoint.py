@@ -26,19 +26,8 @@ from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUN
 from ..integration.runge_kutta import Integers, Stages, inner_stages, moved_state, over_stages
 from ..integration.samples import Record, SampleTimes, components, recorded_step
 from ..integration.scheduler import InLanes, LaneScheduler, Recorder, SchedulerState, outcome_of, with_crossing_times
-from .variation import (
-    RunOptions,
-    Tangent,
-    Tangents,
-    VariationalProblem,
-    delay,
-    moving_leaves,
-    slopes_by_variations,
-    tangent_scale,
-    tangents_of,
-    where_active,
-    with_cells,
-)
+from . import variation
+from .variation import RunOptions, Tangent, Tangents, VariationalProblem, delay, tangent_scale
 
 # The periods of an ensemble solve that are kept for its adjoint: where some of them begin and end, and the steps of the
 # latest ones.
@@ -319,10 +308,10 @@ def solve_with_adjoint(
         zero = jnp.zeros_like(states[0])
         return problem.field(zero, states), recorder.end(problem, zero, states), problem.jumps(zero, states)
 
-    moving = moving_leaves(problem, probe, field_and_end)
+    moving = variation.moving_leaves(problem, probe, field_and_end)
     # One value per cell of the numbers that the tangent moves, and of their rates.
-    active = where_active(problem, probe)
-    active, probe = (jax.tree.map(lambda leaf: with_cells(leaf, size), tree) for tree in (active, probe))
+    active = variation.where_active(problem, probe)
+    active, probe = (jax.tree.map(lambda leaf: variation.with_cells(leaf, size), tree) for tree in (active, probe))
     problem = eqx.combine(active, problem)
     numbers = eqx.filter(problem, moving)
     scheduler = LaneScheduler.of(
@@ -589,7 +578,7 @@ def ensemble_solve_with_tangents(
     if one_kernel and problem.fits_one_kernel and len(tangents) > MOST_FORWARD:
         ended, slopes = _slopes_by_adjoint(problem, tangents, not nonterminal, options)
     else:
-        ended, slopes = slopes_by_variations(problem, tangents, not nonterminal, options, one_kernel)
+        ended, slopes = variation.slopes_by_variations(problem, tangents, not nonterminal, options, one_kernel)
     if not nonterminal:
         outcome = with_crossing_times(problem, ended)
     return outcome, [slope_of_event(outcome, ended, slope, nonterminal) for slope in slopes]
@@ -620,7 +609,9 @@ def _slopes_by_adjoint(
 
     def slope(direction: Tangent) -> Float[Array, " cells"]:
         start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]
-        pairs = zip(jax.tree.leaves(by_number), jax.tree.leaves(where_active(direction, by_number)), strict=True)
+        pairs = zip(
+            jax.tree.leaves(by_number), jax.tree.leaves(variation.where_active(direction, by_number)), strict=True
+        )
         shares = [jnp.sum((gradient * rate).reshape(-1, by_start.shape[1]), axis=0) for gradient, rate in pairs]
         return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
 
@@ -655,7 +646,7 @@ def samples_pulled_back(
     **Returns:** the cotangents, in the shapes of the numbers; NaN in cells that fail with the steps that suit the tangent.
     """
     problem, cells = build(*point), point[0].shape[-1]
-    probe = tangents_of(build, point, [tuple(mixture(point) if rates is None else rates)])[0]
+    probe = variation.tangents_of(build, point, [tuple(mixture(point) if rates is None else rates)])[0]
     recorder = StepRecorder(SampleTimes.of(times, cells, components), cotangents)
     options = (t1, jnp.asarray(cells), settings)
     outcome, (by_start, by_number) = solve_with_adjoint(problem, probe, False, options, recorder)
@@ -668,7 +659,7 @@ def samples_pulled_back(
 
     def numbers_and_start(*point: Float[Array, "... cells"]) -> PyTree:
         problem = build(*point)
-        return where_active(problem, by_number), problem.start()[0]
+        return variation.where_active(problem, by_number), problem.start()[0]
 
     by_point = jax.vjp(numbers_and_start, *point)[1]((by_number, by_start))
     return [jnp.where(is_lost & (outcome.status == FAILED), jnp.nan, part) for part in by_point]

@@ -55,5 +55,5 @@ from .ensemble import hybrid_resets as hybrid_resets
 from .ensemble import solve_hybrid as solve_hybrid
 from .ensemble import solve_hybrid_dense as solve_hybrid_dense
 from .saltation import solve_hybrid_with_tangents as solve_hybrid_with_tangents
-from .sampled_adjoint import hybrid_samples as hybrid_samples
+from .samples import hybrid_samples as hybrid_samples
 from .samples import solve_hybrid_with_samples as solve_hybrid_with_samples

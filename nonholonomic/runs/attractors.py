@@ -1,7 +1,7 @@
 """What runs do in the long term: Lyapunov exponents, bifurcation diagrams, and basins of attraction."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from ..terminal import status_line
 from ..text import shown
 from ..validation import Bound, explaining, require_outside, require_whole, warn
 from .crossings import crossings
-from .event import UNMEASURED, modes_of
+from .event import UNMEASURED, Event, modes_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, check_run, model_of, settings_for_lanes
 from .simulate import Samples, Solved
 from .sweep import Options, require_names, table_of
@@ -379,11 +379,11 @@ def bifurcation(
     system: object,
     start: object,
     t1: float,
-    event: Callable[..., Any] | None = None,
+    event: Event = None,
     count: int = 100,
     skip: int = 300,
     *,
-    axes: dict[str, Any],
+    axes: dict[str, object],
     **options: Any,
 ) -> Table:
     """The last returns of runs to a section over one number: a bifurcation diagram, which `plot` draws as points.
@@ -481,7 +481,7 @@ def basins(
     start: object,
     t1: float,
     *,
-    axes: dict[str, Any],
+    axes: dict[str, object],
     quantities: Sequence[str] | None = None,
     resolution: float = 0.05,
     scattered: bool = False,

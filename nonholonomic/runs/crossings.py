@@ -29,7 +29,7 @@ from ..integration.step import try_step
 from ..sweeps import Table, Variable
 from ..text import shown
 from ..validation import explaining, require_outside, require_whole
-from .event import counted, modes_of, near_zero, problem_of
+from .event import Event, counted, modes_of, near_zero, problem_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
 from .simulate import Samples, Solved, mode_at, nan_where, own_axis
 from .sweep import Options, require_names, table_of
@@ -139,7 +139,7 @@ def crossings_in_cells(
         zeros, false = jnp.zeros(size, int), jnp.zeros(size, bool)
         return Kept(zeros, false, false, zeros, jnp.full(size, -jnp.inf), never, state, none)
 
-    def with_row(kept: Kept, is_new: Array, is_shown: Array, time: Array, state: Array, mode: Any) -> Kept:
+    def with_row(kept: Kept, is_new: Array, is_shown: Array, time: Array, state: Array, mode: Array | int) -> Kept:
         counted, cell = kept.counted + is_new, jnp.arange(size)
         place = jnp.where(is_shown, place_of(counted, skip, count), count)
         return kept._replace(
@@ -241,7 +241,7 @@ class Rise(eqx.Module):
 
     event: Callable[..., Any]
 
-    def __call__(self, t: Any, y: Any) -> Any:
+    def __call__(self, t: Array, y: object) -> Array:
         return -self.event(t, y)
 
 
@@ -268,13 +268,13 @@ def crossings(
     system: object,
     start: object,
     t1: float,
-    event: Callable[..., Any] | None = None,
+    event: Event = None,
     count: int = 10,
     skip: int = 0,
     *,
     direction: str = "fall",
     side: str = "before",
-    axes: dict[str, Any] | None = None,
+    axes: dict[str, object] | None = None,
     quantities: Sequence[str] | None = None,
     scattered: bool = False,
     max_steps: int = DEFAULT_MAX_STEPS,

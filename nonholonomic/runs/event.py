@@ -6,8 +6,8 @@ differentiated. If the function depends on time, a clock is added to the state.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, ClassVar, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -20,6 +20,7 @@ from ..compilation.components import over_lanes
 from ..compilation.tracing import dependent_outputs, is_elementary, with_own_numbers
 from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, solve_ensemble_with_tangents, tangents_by
 from ..hybrid import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid, solve_hybrid_with_tangents
+from ..hybrid.ensemble import Count
 from ..hybrid.saltation import UNMEASURED, Clock
 from ..integration import AbstractProblem, ExtendedProblem, Lanes, Outcome, Settings, States, solve_ensemble
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_run
@@ -30,11 +31,14 @@ from ..text import described, gathered, likely, shown
 from ..validation import UNTRACEABLE, as_number, explaining, is_traced, nan_unless, warn
 from .model import AbstractModel, Names, Number, Start, check_run, model_of, require_event, settings_for_lanes
 
+#: A user's event, a function of time and motion or of time and state; or `None` for that of the system itself.
+Event: TypeAlias = Callable[..., Array] | None
+
 
 class Motion:
     """The quantities of one state as attributes, computed when they are read: `motion.speed`."""
 
-    def __init__(self, read: Callable[[str], Array], names: Any):
+    def __init__(self, read: Callable[[str], Array], names: Collection[str]):
         self._read, self._names = read, names
 
     def __getattr__(self, name: str) -> Array:
@@ -78,7 +82,7 @@ class EventFunction(eqx.Module):
         return self.parameters.tree["event"](t, values)
 
     @property
-    def function(self) -> Any:
+    def function(self) -> Callable[..., Array]:
         """The user's function, with its present numbers."""
         return self.parameters.tree["event"].event
 
@@ -251,7 +255,7 @@ class EventMode(AbstractBatchedMode):
     def shown(self, state: Float[Array, "components times"]) -> Float[Array, "shown times"]:
         return self.modes[self.index].shown(self._parts(state)[0])
 
-    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
+    def between(self, motion: PyTree, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
         return self.modes[self.index].between(motion, passed)
 
     def _parts(self, state: Array) -> tuple[Array, Array]:
@@ -316,7 +320,7 @@ class Ensemble(eqx.Module):
         *modes, states = self.start
         return dataclasses.replace(self, start=(*modes, states * (1.0 + share)))
 
-    def solve(self, t1: Any, cells: Any, settings: Settings, traced: bool = False) -> Outcome | HybridOutcome:
+    def solve(self, t1: Number, cells: Count, settings: Settings, traced: bool = False) -> Outcome | HybridOutcome:
         """The outcome of the runs.
 
         **Arguments:** `t1`: horizon [s]; `cells`: number of cells to run, the rest is padding; `traced`: whether numbers
@@ -335,9 +339,9 @@ class Ensemble(eqx.Module):
 
     def solve_with_tangents(
         self,
-        tangents: Sequence[Any],
-        t1: Any,
-        cells: Any,
+        tangents: Sequence["Ensemble"],
+        t1: Number,
+        cells: Count,
         settings: Settings,
         traced: bool = False,
         one_kernel: bool = True,
@@ -413,7 +417,7 @@ def event_time(
     system: object,
     start: object,
     t1: Float[ArrayLike, ""],
-    event: Callable[..., Any] | None = None,
+    event: Event = None,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
     *,

@@ -27,7 +27,7 @@ from ..sweeps.running import workers
 from ..terminal import status_line
 from ..text import in_unit, likely, shown, unit_of
 from ..validation import as_number, explaining, nan_unless, require
-from .event import SILENT, time_of_event
+from .event import SILENT, Event, time_of_event
 from .model import AbstractModel, check_run, model_of, require_event
 from .simulate import sampled
 from .table import first_events
@@ -216,7 +216,7 @@ class EventTimes(AbstractEventTimes):
     (('time 1', 'time 2', 'time 3'), [False, False, True])
     """
 
-    event: Callable[..., Any] | None = None
+    event: Event = None
     input: Any = None
     until: Float[Array, "..."] | None = eqx.field(converter=as_number, default=None)
     student: Float[Array, ""] | None = eqx.field(converter=as_number, default=None)

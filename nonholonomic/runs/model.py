@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Self, TypeAlias
 
 import diffrax
@@ -17,13 +17,16 @@ from ..hybrid import AbstractBatchedMode, HybridOutcome
 from ..hybrid.ensemble import OnlyMode
 from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
-from ..parameters import full_name, numbers, numbers_of, with_numbers
+from ..parameters import Parameters, full_name, numbers, numbers_of, with_numbers
 from ..sweeps import Axis, Quantity, Variable
 from ..text import likely_fix, shown
 from ..validation import ArrayOrList, require_all
 
 #: A single number, or one for each cell.
 Number: TypeAlias = Array | np.ndarray | float
+
+#: The values of parameters: full name -> a number, or one for each cell.
+Columns: TypeAlias = Mapping[str, ArrayLike]
 
 #: The ranges of sliders: name of a parameter -> (lowest, highest) value.
 Sliders: TypeAlias = dict[str, tuple[float, float]]
@@ -71,7 +74,7 @@ class AbstractModel(eqx.Module):
         """The value of a parameter by its full name."""
 
     @abc.abstractmethod
-    def replaced(self, values: dict[str, Any]) -> Self:
+    def replaced(self, values: Columns) -> Self:
         """The model with other values, scalars or one per cell, of some parameters; the modules check concrete values."""
 
     @abc.abstractmethod
@@ -79,7 +82,7 @@ class AbstractModel(eqx.Module):
         """For each full name the name of an axis, its unit, and a description."""
 
     @abc.abstractmethod
-    def description(self) -> dict[str, Any]:
+    def description(self) -> dict[str, object]:
         """The model as plain data, for the request of a table."""
 
     # Whether a run may begin.
@@ -88,11 +91,11 @@ class AbstractModel(eqx.Module):
     def check(self) -> None:
         """Raise `ValueError` unless the concrete numbers allow a run."""
 
-    def require_values(self, values: dict[str, Any]) -> None:
+    def require_values(self, values: Columns) -> None:
         """Raise `ValueError` unless the modules allow these values of parameters."""
         self.replaced(values)
 
-    def check_axes(self, grid: list[Axis], cells: Iterable[dict[str, Any]]) -> None:
+    def check_axes(self, grid: list[Axis], cells: Iterable[Columns]) -> None:
         """Raise `ValueError` unless the model may run for the cells of a grid; `cells`: columns of their parameters."""
         for columns in cells:
             self.replaced(columns).check()
@@ -101,7 +104,7 @@ class AbstractModel(eqx.Module):
     def legal(self) -> Bool[Array, "..."]:
         """Whether the numbers, which may be traced, allow a run."""
 
-    def legal_cells(self, columns: dict[str, Any]) -> Any:
+    def legal_cells(self, columns: Columns) -> Bool[np.ndarray, "*cells"] | None:
         """Whether each cell of a table is legal, `None` if `check_axes` has raised an error for those that are not."""
         return None
 
@@ -112,7 +115,7 @@ class AbstractModel(eqx.Module):
     has_event: ClassVar[bool]
 
     #: Further variables of a table that are times: name -> (description, the model with its event).
-    further_times: ClassVar[dict[str, tuple[str, Any]]] = {}
+    further_times: ClassVar[dict[str, tuple[str, "AbstractModel"]]] = {}
 
     #: Name and description of each row of `Transition.counts`.
     counters: ClassVar[dict[str, str]] = {}
@@ -168,7 +171,7 @@ class AbstractModel(eqx.Module):
     at_rest: ClassVar[str] = ""
 
     #: A user's symmetry of the reduced state, as `Parameters`; or `None`.
-    symmetry: Any = eqx.field(default=None, kw_only=True)
+    symmetry: Parameters | None = eqx.field(default=None, kw_only=True)
 
     #: Whether the motion or the event depends on time.
     depends_on_time: ClassVar[bool]
@@ -220,7 +223,7 @@ class AbstractModel(eqx.Module):
         """The values of `ends`, for the outcome and the initial states of some cells."""
 
 
-def statuses(codes: Int[Array, " cells"], left_domain: Any) -> Int[Array, " cells"]:
+def statuses(codes: Int[Array, " cells"], left_domain: Status | Int[Array, " cells"]) -> Int[Array, " cells"]:
     """How runs have ended, as integers of `Status`, by the codes of the integration. **Arguments:** `left_domain`: the
     `Status` of a run that left its domain, or that of each run."""
     status = jnp.full(jnp.shape(codes), int(Status.COMPLETED))
@@ -263,7 +266,7 @@ class AbstractSceneModel(AbstractModel):
         value = numbers(root, self.roots[root])[name]
         return jnp.zeros(()) if value is None else value
 
-    def replaced(self, values: dict[str, Any]) -> Self:
+    def replaced(self, values: Columns) -> Self:
         own = {name: value for name, value in values.items() if not name.startswith("event.")}
         event = self.event
         if event is not None:
@@ -273,7 +276,7 @@ class AbstractSceneModel(AbstractModel):
 
 @functools.singledispatch
 def model_of(
-    system: object, start: object, event: Any = None, input: object = None, jumps: object = None
+    system: object, start: object, event: object = None, input: object = None, jumps: object = None
 ) -> AbstractModel:
     """The model of a system, for the functions of this room.
 

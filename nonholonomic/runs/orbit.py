@@ -32,7 +32,7 @@ from ..validation import as_number, explaining, is_traced, require_outside
 from .branch import Orbit
 from .continuation import FINER, ILLEGAL, NEAR, RANK, REASONS, SAME_ORBIT
 from .crossings import SAME, on_margin, require_section, section_of
-from .event import EventTime, modes_of
+from .event import Event, EventTime, modes_of
 from .model import AbstractModel, AbstractSceneModel, Start, check_run, model_of, settings_for_lanes
 
 #: The most Newton steps; the residual at which they have converged, in units of the tolerance.
@@ -111,7 +111,7 @@ class OrbitSolve(EventTime):
 
     @classmethod
     def of_model(
-        cls, model: Any, t1: Array, settings: Settings, is_driven: bool, free: tuple[int, ...]
+        cls, model: AbstractModel, t1: Array, settings: Settings, is_driven: bool, free: tuple[int, ...]
     ) -> tuple[Any, ...]:
         """The solve and its leaves. **Arguments:** as for `EventTime.of`, and fields."""
         timed, *leaves = EventTime.of(model, t1, settings, False)
@@ -433,7 +433,7 @@ def depth(part: Any) -> int:
     return 1 + max(map(depth, part), default=0) if isinstance(part, list | tuple) else np.ndim(part)
 
 
-def distinct_orbits(system: object, guesses: Any, event: Any, options: dict[str, Any]) -> list[Orbit]:
+def distinct_orbits(system: object, guesses: Any, event: Event, options: dict[str, Any]) -> list[Orbit]:
     """The distinct orbits that several guesses lead to, in the order of the guesses."""
     require_outside((system, guesses), "periodic_orbit of several guesses", "jax.vmap of periodic_orbit")
     guesses = guesses if isinstance(guesses, tuple | eqx.Module) else jnp.asarray(guesses, float)
@@ -479,7 +479,7 @@ def require_unshifted(model: AbstractSceneModel) -> None:
 def periodic_orbit(
     system: object,
     start: object,
-    event: Callable[..., Any] | None = None,
+    event: Event = None,
     *,
     period: Float[ArrayLike, ""] | None = None,
     free: Sequence[str] | None = None,

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .. import sweeps
 from ..compilation.xla_cpu import programs_in
@@ -26,7 +26,7 @@ from ..sweeps.grid import EQUATIONS, FOR_A_TIME, REMARK, SHOWN_IN, columns
 from ..sweeps.table import cells_with
 from ..text import likely, shown, unit_of
 from ..validation import as_number, explaining, require_flag, require_outside, require_whole, warn
-from .event import modes_of
+from .event import Event, modes_of
 from .model import AbstractModel, AbstractSceneModel, Number, check_horizon, model_of, require_event, settings_for_lanes
 from .simulate import Samples
 from .table import TableForm, TableJob
@@ -40,7 +40,7 @@ PACKAGES = ("nonholonomic", "tippe", "stroller", "jax", "equinox")
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 
-def has_users_code(part: Any) -> bool:
+def has_users_code(part: object) -> bool:
     """Whether a tree of modules has a function, or a module of a class, that is not of these packages."""
     if isinstance(part, eqx.Module):
         if type(part).__module__.partition(".")[0] not in PACKAGES:
@@ -58,7 +58,7 @@ def checksum_of(model: AbstractModel) -> str:
     but not of its parameters."""
     arrays, static = eqx.partition(model, eqx.is_array)
 
-    def equations(arrays: Any) -> list[Any]:
+    def equations(arrays: PyTree) -> list[Array | None]:
         modes, _, state = modes_of(eqx.combine(arrays, static), 1, jnp.asarray(1e-9), ())
         parts, time = [], jnp.zeros(1)
         for mode in modes:
@@ -118,8 +118,8 @@ def sweep(
     start: object,
     t1: float,
     *,
-    axes: dict[str, Any],
-    event: Callable[..., Any] | None = None,
+    axes: dict[str, object],
+    event: Event = None,
     crossing: str = "first",
     times: Any = None,
     quantities: Sequence[str] = (),
@@ -233,7 +233,7 @@ def require_names(known: dict[str, Quantity], quantities: Sequence[str]) -> None
 
 def table_of(
     model: AbstractModel,
-    axes: Any,
+    axes: object,
     t1: float,
     options: Options,
     crossing: str = "first",
@@ -258,7 +258,7 @@ def table_of(
     return compute_table(job, grid, request, options)
 
 
-def full_sensitivities(model: AbstractModel, names: Any, crossing: str) -> list[str]:
+def full_sensitivities(model: AbstractModel, names: object, crossing: str) -> list[str]:
     """The full names of the parameters with respect to which to differentiate, checked."""
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"sensitivities = {shown(names)} must be a list of names, such as ['scene.friction.mu']")

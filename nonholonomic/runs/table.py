@@ -15,6 +15,7 @@ from ..integration import Outcome, Settings, solve_by_diffrax
 from ..integration.problem import TIGHTEST, TIGHTEST_IN_SINGLE, Status
 from ..kernels import place_of_jax
 from ..sweeps import Axis, Variable
+from ..sweeps.grid import Values
 from ..validation import as_number
 from .event import SILENT, Ensemble, counted, status_of
 from .model import AbstractModel, Number
@@ -25,6 +26,10 @@ WORDS = tuple(status.word for status in sorted(Status)[1:])
 
 #: Descriptions of the counters of every run.
 COUNTED = {"steps": "steps", "rejected": "rejected steps"}
+
+
+#: The parameters of some cells, or their results: name -> values.
+Cells = dict[str, Values]
 
 
 class TableForm(NamedTuple):
@@ -139,7 +144,7 @@ class TableJob(NamedTuple):
         ends = self.model.ends if self.samples is None else ()
         return (*self.times, *self.model.further_times, "end_time", *ends)
 
-    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+    def __call__(self, columns: Cells, count: int) -> Cells:
         """The variables of some cells, of which only the first `count` are run."""
         if self.listed:
             values = [axis.values[columns["cell"]] for axis in self.listed]
@@ -150,7 +155,7 @@ class TableJob(NamedTuple):
         with place_of_jax(size, self.settings.device):
             return self._of_cells(columns, count)
 
-    def _of_cells(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+    def _of_cells(self, columns: Cells, count: int) -> Cells:
         """The variables of some cells of a grid, of which only the first `count` are run."""
         if self.by_diffrax and count == 0:
             # Diffrax always computes a whole chunk, so a call only to compile would compute the first chunk twice.
@@ -173,7 +178,7 @@ class TableJob(NamedTuple):
             results[name] = np.where(is_legal, values, nothing).astype(values.dtype)
         return results
 
-    def _of_legal(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+    def _of_legal(self, columns: Cells, count: int) -> Cells:
         """The variables of some cells, of which only the first `count` are run, which are legal."""
         size = next((len(values) for values in columns.values()), 1)
         cells = self.model.replaced(columns)
@@ -202,8 +207,8 @@ class TableJob(NamedTuple):
         return sampled | variables
 
     def _results(
-        self, cells: AbstractModel, columns: dict[str, Any], size: int, count: int, slopes: dict[str, str] | None
-    ) -> dict[str, Any]:
+        self, cells: AbstractModel, columns: Cells, size: int, count: int, slopes: dict[str, str] | None
+    ) -> Cells:
         """The variables of one run of every cell."""
         derivatives, grazing, settings = {}, False, self.settings
         if slopes:
@@ -276,8 +281,8 @@ def at_the_end(
 
 @eqx.filter_jit
 def _with_tangents(
-    model: AbstractModel, columns: dict[str, Any], names: tuple[str, ...], tolerance: Number, size: int, continues: bool
-) -> tuple[Ensemble, tuple[Any, ...], list[Float[Array, "..."]]]:
+    model: AbstractModel, columns: Cells, names: tuple[str, ...], tolerance: Number, size: int, continues: bool
+) -> tuple[Ensemble, tuple[Ensemble, ...], list[Float[Array, "..."]]]:
     """The runs of all cells, the tangents along the named parameters, and the scale of each tangent."""
 
     def build(values: tuple[Array, ...], _: int | None) -> Ensemble:

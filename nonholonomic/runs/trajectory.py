@@ -158,7 +158,7 @@ def page_of(model: AbstractModel, sliders: Sliders | None, t1: float) -> tuple[L
     raise NotImplementedError(f"{type(model).__name__} has no page")
 
 
-def sliders_of(model: AbstractModel, ranges: Any, drawn: tuple[str, ...] = ()) -> tuple[Slider, ...]:
+def sliders_of(model: AbstractModel, ranges: object, drawn: tuple[str, ...] = ()) -> tuple[Slider, ...]:
     """The sliders for the ranges that a user passes.
 
     **Arguments:** `ranges`: name of a parameter -> (lowest, highest) value; `drawn`: parameters, in addition to
@@ -438,7 +438,7 @@ class AbstractRun(Tabular, eqx.Module):
 
     def explore(
         self,
-        path: Any = None,
+        path: str | Path | None = None,
         sliders: Sliders | None = None,
         unit: Unit = None,
         draw: Draw = None,

@@ -20,7 +20,7 @@ from ..compilation.tracing import dependent_outputs, is_elementary, jumps_of, na
 from ..compilation.xla_cpu import Function, equations_in, traced
 from ..parameters import TreeForm
 from ..text import counted, described, shown
-from ..validation import as_number, is_traced, require, warn
+from ..validation import ArrayOrList, as_number, is_traced, require, warn
 from . import mechanics
 from .mechanics import AbstractFormulation, AbstractMode, AbstractSystem, Lagrange, State, components_of, exit_of
 
@@ -342,7 +342,7 @@ def check_start(system: Hybrid | AbstractSystem, start: Any) -> None:
         _check_functions(form, prefix, tuple(mechanics.written(mode, name) for name in names))
 
 
-def _check_vector(value: Any, name: str, size: int | None) -> None:
+def _check_vector(value: ArrayOrList, name: str, size: int | None) -> None:
     value = as_number(value)
     if not isinstance(value, jax.Array):
         raise ValueError(f"{name} = {shown(value)} is not a list of numbers")

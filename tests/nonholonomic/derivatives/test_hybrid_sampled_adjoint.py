@@ -8,7 +8,7 @@ import pytest
 from close import assert_close
 
 import nonholonomic.derivatives.adjoint as adjoint
-import nonholonomic.hybrid.sampled_adjoint as samples
+import nonholonomic.hybrid.samples as samples
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, hybrid_samples
 from nonholonomic.integration import AbstractProblem, Settings
 from nonholonomic.integration.problem import LEFT_DOMAIN, RUNNING
