@@ -10,7 +10,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,10 +20,7 @@ from jax.tree_util import DictKey
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .compilation.components import Held, functions_in, outside
-from .text import Numbers, Stated, gathered, likely, name_of, spread, unit_of
-
-#: The values of a parameter along an axis of a grid.
-Axis = TypeVar("Axis")
+from .text import MOST_PARTS, Numbers, Stated, gathered, likely, name_of, spread, unit_of
 
 
 def numbers(root: str, tree: PyTree, functions: bool = True) -> dict[str, Any]:
@@ -142,7 +139,7 @@ def full_name(argument: str, name: str, known: list[str]) -> str:
     matches = meant(name, known)
     if len(matches) != 1:
         several = " or ".join(matches)
-        problem = f"could be {several}" if matches else f"must be one of {', '.join(known)}{_hint(name, known)}"
+        problem = f"could be {several}" if matches else _unknown(name, known)
         raise ValueError(f"{argument}: {name!r} {problem}")
     return matches[0]
 
@@ -164,34 +161,22 @@ class ByName(dict[str, Any]):
             raise KeyError(str(error)) from None
 
 
-def full_axes(axes: dict[str, Axis], known: list[str]) -> dict[str, Axis]:
-    """The axes of a grid under full names; a name may be the end of a full name, such as `"offset"`.
-
-    **Arguments:** `axes`: name -> values; `known`: the full names of the parameters.
-
-    **Raises:** `ValueError` for a name that matches none or several parameters, and for a parameter that is named
-    twice.
-    """
-    by_full_name: dict[str, Axis] = {}
-    for name, values in axes.items():
-        full = full_name("axes" if meant(name, known) else "unknown axis", name, known)
-        if full in by_full_name:
-            raise ValueError(f"axes: {full!r} is named twice")
-        by_full_name[full] = values
-    return by_full_name
-
-
 def meant(name: Any, known: Sequence[str]) -> list[str]:
     """The full names that match a name."""
     return [name] if name in known else [known_name for known_name in known if known_name.endswith("." + str(name))]
 
 
-def _hint(name: object, known: Sequence[str]) -> str:
-    """What an unknown name may mean, as an addition to a message: the numbers of a module, or a similar name."""
-    parts = [full[full.index(f".{name}.") + 1 :] for full in known if f".{name}." in full]
-    if parts:
-        return f"; did you mean {' or '.join(map(repr, parts[:3]))}?"
-    return likely(str(name).rsplit(".", 1)[-1], [full.rsplit(".", 1)[-1] for full in known])
+def _unknown(name: object, known: Sequence[str]) -> str:
+    """What is wrong with an unknown name, and what it may mean: the numbers of a module or an array, or a similar name. Of an
+    array with many numbers, the message names the first and the last."""
+    arrays: dict[str, list[str]] = {}
+    for full in known:
+        arrays.setdefault(re.sub(r"(\[\d+\])+$", "", full), []).append(full)
+    listed = (f"{own[0]}, ..., {own[-1]}" if len(own) > MOST_PARTS else ", ".join(own) for own in arrays.values())
+    hint = likely(str(name).rsplit(".", 1)[-1], [full.rsplit(".", 1)[-1] for full in known])
+    if parts := re.findall(rf"\.({re.escape(str(name))}[.\[].*)", "\n".join(known)):
+        hint = f"; did you mean {' or '.join(map(repr, parts[:3]))}?"
+    return f"must be one of {', '.join(listed)}{hint}"
 
 
 def _replaced(name: str, tree: PyTree, values: Mapping[str, Any]) -> PyTree:

@@ -13,7 +13,7 @@ from tops import rutstam_top
 import nonholonomic.sweeps
 import stroller
 import tippe
-from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.parameters import full_name, numbers, with_numbers
 from tippe.runs.model import TopModel
 from tippe.runs.verbs import launches
 
@@ -68,9 +68,9 @@ def test_a_number_is_replaced_by_the_end_of_its_name():
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
-        ({"ofset": [0.005]}, "unknown axis: 'ofset' must be one of .*; did you mean 'offset'"),
+        ({"ofset": [0.005]}, "axes: 'ofset' must be one of .*; did you mean 'offset'"),
         ({"offset": [0.02, 0.021]}, "axes: 'offset' could be scene.body.offset or scene.body.stem.offset"),
-        ({"body.mass": [0.02], "mass": [0.02]}, "axes: 'scene.body.mass' is named twice"),
+        ({"body.mass": [0.02], "mass": [0.02]}, "axes = body.mass, mass: a number is named twice"),
         ({"theta": [0.1]}, "axes: 'launch.theta' has its own argument"),
     ],
 )
@@ -80,14 +80,14 @@ def test_an_axis_whose_name_means_nothing_or_too_much_is_refused(axes, message):
 
 
 def test_only_what_can_be_varied_is_suggested():
-    with pytest.raises(ValueError, match="unknown axis") as refused:
+    with pytest.raises(ValueError, match="axes: 'colour'") as refused:
         axes_of(TOP, {"colour": [1.0]})
     suggestions = re.findall(r"[\w.\[\]]+", str(refused.value).partition("must be one of ")[2])
     assert "scene.surface.tilt" in suggestions
     for name in suggestions:
         if name not in ("launch.theta", "launch.spin", "launch.eta", "launch.place[2]"):
             assert axes_of(TOP, {name: [1e-3]}) if "body" not in name else name in numbers("scene", TOP)
-    with pytest.raises(ValueError, match="unknown axis: 'colour'") as refused:
+    with pytest.raises(ValueError, match="axes: 'colour'") as refused:
         stroller.sweep(PRAM, RIDE, 1.0, axes={"colour": [1.0]})
     names = re.findall(r"[\w.\[\]]+", str(refused.value).partition("must be one of ")[2])
     assert {"scene.body.centre", "launch.place[1]", "launch.speed"} <= set(names)
@@ -113,3 +113,34 @@ def test_what_the_function_of_a_ground_holds_may_be_lists_in_tables_too():
     assert [axis.name for axis in grid] == ["spin"]
     with pytest.raises(ValueError, match=r"scene\.gravity must be one number, not of shape"):
         launches(eqx.tree_at(lambda s: s.gravity, scene, jnp.ones(2)), {"theta": 0.1, "spin": 1.0}, None, 1.0, 1e-9)
+
+
+class Knots(eqx.Module):
+    """A drive force with knots."""
+
+    knots: jax.Array
+    gain: float = 1.0
+
+    def __call__(self, t, motion):
+        return self.gain * jnp.interp(t, jnp.linspace(0.0, 1.0, self.knots.size), self.knots), 0.0
+
+
+def test_the_numbers_of_a_large_input_have_no_names_and_the_message_says_what_to_do():
+    options = {"axes": {"knots[3]": [1.0]}, "input": Knots(jnp.ones(300))}
+    with pytest.raises(
+        ValueError, match=r"axes: 'knots\[3\]': input = Knots .* more than 256 numbers, .* reads large arrays"
+    ):
+        stroller.sweep(PRAM, RIDE, 1.0, **options)
+    with pytest.raises(ValueError, match=r"axes: 'input.gain': input = Knots .* more than 256 numbers"):
+        nonholonomic.sweep(PRAM, RIDE, 1.0, **options | {"axes": {"input.gain": [1.0]}})
+    with pytest.raises(ValueError, match=r"'input.force': input = .* is a function, .* write an equinox\.Module"):
+        stroller.sweep(PRAM, RIDE, 1.0, axes={"input.force": [1.0]}, input=lambda t, motion: (1.0, 0.0))
+    # A name that has nothing to do with the input.
+    with pytest.raises(ValueError, match=r"'colour' must be one of scene\.body\.mass"):
+        stroller.sweep(PRAM, RIDE, 1.0, **options | {"axes": {"colour": [1.0]}})
+
+
+def test_a_message_names_the_first_and_the_last_number_of_an_array():
+    known = ["scene.gravity", *(f"input.knots[{k}]" for k in range(200))]
+    with pytest.raises(ValueError, match=r"gravity, input.knots\[0\], \.\.\., input.knots\[199\]; did you mean 'knots"):
+        full_name("axes", "knots", known)

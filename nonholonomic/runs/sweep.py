@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -243,11 +243,7 @@ def table_of(
     timed: bool = True,
 ) -> Table:
     """The table of a model. **Arguments:** `axes`: as for `sweep`; the others as for `TableJob`, checked."""
-    if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
-        raise ValueError(f"axes = {shown(axes)} must be a dictionary, name of a number -> values")
-    named = {model.full_name("axes", name): values for name, values in axes.items()}
-    if len(named) < len(axes):
-        raise ValueError(f"axes = {', '.join(axes)}: a number is named twice")
+    named = full_axes(axes, model.full_name)
     sensitivities = full_sensitivities(model, options.sensitivities, crossing)
     labels = model.label([*named, *(name for name in sensitivities if name not in named)])
     grid = [axis(labels[name][0], name, labels[name][1], values, labels[name][2]) for name, values in named.items()]
@@ -256,6 +252,22 @@ def table_of(
     check_cells(model, grid, options)
     request = {"t1": float(t1)} | ({} if crossing == "first" else {"crossing": crossing})
     return compute_table(job, grid, request, options)
+
+
+def full_axes(axes: object, full_name: Callable[[str, str], str]) -> dict[str, PyTree]:
+    """The axes of a grid under full names; a name may be the end of a full name, such as `"offset"`.
+
+    **Arguments:** `axes`: name -> values; `full_name`: function of the argument and a name, as of an `AbstractModel`.
+
+    **Raises:** `ValueError` for anything but a dictionary, for a name that matches none or several parameters, and for a
+    parameter that is named twice.
+    """
+    if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
+        raise ValueError(f"axes = {shown(axes)} must be a dictionary, name of a number -> values")
+    by_full_name = {full_name("axes", name): values for name, values in axes.items()}
+    if len(by_full_name) < len(axes):
+        raise ValueError(f"axes = {', '.join(axes)}: a number is named twice")
+    return by_full_name
 
 
 def full_sensitivities(model: AbstractModel, names: object, crossing: str) -> list[str]:

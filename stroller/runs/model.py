@@ -21,7 +21,7 @@ from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import AbstractProblem, Outcome
 from nonholonomic.integration.problem import DEFAULT_MAX_STEPS, Status, require_run
-from nonholonomic.parameters import description, full_axes, numbers
+from nonholonomic.parameters import description, meant, numbers
 from nonholonomic.runs.event import EventFunction, with_clock, with_event
 from nonholonomic.runs.identify import Data, FreeNumbers, Priors, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, run_of, statuses
@@ -126,6 +126,17 @@ class RideModel(AbstractSceneModel):
     @property
     def fixed(self) -> tuple[str, ...]:
         return () if isinstance(self.scene.surface, Plane) else ("scene.body.centre",)
+
+    def full_name(self, argument: str, name: str) -> str:
+        controls, field = inputs.users_input(self.input), name.removeprefix("input.").partition("[")[0]
+        is_of_input = name.startswith("input.") or hasattr(controls, field)
+        if isinstance(self.input, Formula) and is_of_input and not meant(name, self.known):
+            raise ValueError(
+                f"{argument}: {name!r}: input = {name_of(controls)} is a function, or has more than {inputs.MOST_ELEMENTS} "
+                "numbers, so that they have no names: write an equinox.Module that holds only the numbers to vary, and reads "
+                "large arrays from outside, as constants; or map stroller.simulate over inputs by jax.vmap"
+            )
+        return super().full_name(argument, name)
 
     def label(self, names: list[str]) -> dict[str, tuple[str, str, str]]:
         """The name of an axis is the last part of its full name, or the last two parts if one is ambiguous. Numbers of a
@@ -440,10 +451,8 @@ def sweep(
     """
     require_outside((scene, launch, t1, axes, input, jumps), "sweep", "simulate")
     model = checked_model(scene, launch, t1, input, tolerance, jumps)
-    if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
-        raise ValueError(f"axes = {shown(axes)} must be a dictionary, full name of a parameter -> values")
     options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor, device=device)
-    return table_of(model, full_axes(axes, model.known), t1, options, form=FORM)
+    return table_of(model, axes, t1, options, form=FORM)
 
 
 # Estimate parameters of a stroller, its ground and its launch from recorded rides, and their posterior.

@@ -185,14 +185,14 @@ def test_axes_of_one_name_are_told_apart():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (dict(axes={"scene.body.colour": [1.0]}), r"unknown axis: 'scene\.body\.colour'"),
+        (dict(axes={"scene.body.colour": [1.0]}), r"axes: 'scene\.body\.colour'"),
         (dict(axes={"launch.speed": []}), r"speed must be a number or a non-empty list"),
         (dict(axes={"scene.body.mass": [1.0, -1.0]}), r"mass = .* must be greater than 0\.0"),
         (dict(axes={"launch.place[1]": [0.0, 2.0]}), r"place\[1\] = .* must be at most 1\.57"),
         (dict(axes={}, tolerance=1.0), r"tolerance = 1\.0 must be at most"),
         (dict(axes={}, max_steps=0), r"max_steps = 0 must be a whole number of at least 1"),
         (dict(axes=None), r"axes = None must be a dictionary"),
-        (dict(axes={3: [1.0]}), r"axes = \{3: \[1\.0\]\} must be a dictionary, full name of a parameter -> values"),
+        (dict(axes={3: [1.0]}), r"axes = \{3: \[1\.0\]\} must be a dictionary, name of a number -> values"),
         (dict(axes={}, t1=[1.0, 2.0]), r"t1 must be one number, not of shape \(2,\); axes of sweep take lists"),
         (dict(axes={}, launch=Launch((0.0, 0.1), 0.0, [1.0, 2.0])), r"launch\.speed must be one number, not of shape"),
         (dict(axes={}, launch=1.0), r"launch = 1\.0 must be a Launch"),

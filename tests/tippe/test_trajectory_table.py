@@ -243,7 +243,7 @@ def test_it_is_drawn_over_time(table):
         ({"quantities": ["theta", "mood"]}, "quantities: 'mood' must be one of theta, eta"),
         ({"quantities": ["theta", "theta"]}, "quantities: 'theta' must be named only once"),
         ({"axes": {3: [1.0]}}, "axes = {3: [1.0]} must be a dictionary"),
-        ({"axes": {"scene.body.colour": [1.0]}}, "unknown axis: 'scene.body.colour'"),
+        ({"axes": {"scene.body.colour": [1.0]}}, "axes: 'scene.body.colour'"),
         ({"axes": {"launch.theta": [0.1]}}, "'launch.theta' has its own argument"),
         ({"scene": "a top"}, "scene = 'a top' must be a Scene"),
     ],

@@ -25,11 +25,11 @@ from nonholonomic.integration.problem import (
     require_run,
     require_times,
 )
-from nonholonomic.parameters import full_axes, numbers, with_numbers
+from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.runs.attractors import LyapunovExponent, exponent_of_model
 from nonholonomic.runs.event import EventTime, time_of_event
 from nonholonomic.runs.model import Number, check_horizon, settings_for_lanes
-from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_sensitivities, samples_of
+from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_axes, full_sensitivities, samples_of
 from nonholonomic.runs.table import TableForm, TableJob
 from nonholonomic.sweeps import Axis, Table, axis
 from nonholonomic.terminal import status_line
@@ -190,11 +190,9 @@ def launches(
     **Raises:** `ValueError` for arguments out of range or an unknown axis.
     """
     require_kind(scene, "scene", Scene)
-    if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
-        raise ValueError(f"axes = {shown(axes)} must be a dictionary, path of a number -> values")
     # Those of a launch that leaves nothing out.
     complete = Launch(0.0, 0.0, place=(0.0, 0.0, 0.0), velocity=(0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0))
-    axes = full_axes(axes or {}, TopModel(scene=scene, launch=complete).known)
+    axes = full_axes({} if axes is None else axes, TopModel(scene=scene, launch=complete).full_name)
     for name in ("theta", "spin") if launch_values.get("launch") is None else ():
         if launch_values.get(name, 0.0) is None:
             raise ValueError(f"{name} = None is not a number: pass a launch, or both theta and spin")
