@@ -155,11 +155,15 @@ class Orbit(eqx.Module):
         pairs = zip(self.names, np.asarray(self.state).tolist(), strict=True)
         in_returns = f" in {self.returns} returns" if self.returns > 1 else ""
         stability = "stable" if self.stable else "unstable"
+        # The guess; a point of a branch has none.
+        start = [self.leaves[k] for k in self.search.starts] if self.search else self.state
+        distance = np.max(np.abs(np.asarray(self.state) - np.asarray(start)))
         lines = [
             f"{stability} periodic orbit with a period of {float(self.period):.12g} s{in_returns}",
             ", ".join(f"{name} = {value:.12g}" for name, value in pairs),
             f"multipliers {', '.join(multipliers)}",
-            f"error below {float(self.error):.1g}, Newton steps {int(self.iterations)}",
+            f"error below {float(self.error):.1g}, Newton steps {int(self.iterations)}"
+            + f", {distance:.2g} away from the guess" * bool(distance),
         ]
         if int(self.family):
             lines.append(f"one of a family of orbits, in {counted(int(self.family), 'direction')}")

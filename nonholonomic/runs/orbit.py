@@ -38,6 +38,9 @@ from .model import AbstractModel, AbstractSceneModel, Start, check_run, model_of
 #: The most Newton steps; the residual at which they have converged, in units of the tolerance.
 MOST_NEWTON, CONVERGED = 30, 30.0
 
+#: The longest Newton step, in units of the size of the guess or of its orbit.
+LEASH = 0.5
+
 #: Relative steps of a number for the differences that give the derivatives of multipliers, and their weights.
 STENCIL, STENCIL_STEP = ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0)), 1e-3
 
@@ -304,11 +307,16 @@ class OrbitSolve(EventTime):
             settled = jnp.where(falls & (jnp.abs(shift) < NEAR * new.time), moved, new.state)
             # The size of the orbit: its state, or the radius of a circle with its speed and period.
             extent = jnp.max(jnp.abs(new.rate), axis=0) * new.time
-            *sizes, residual, length = (jnp.max(jnp.abs(part), axis=0) for part in (state, new.state, miss, change))
+            own, *sizes, residual, length = (
+                jnp.max(jnp.abs(part), axis=0) for part in (start, state, new.state, miss, change)
+            )
+            # Near a fold, Newton's step leads many turns away.
+            longest = LEASH * jnp.maximum(own, extent / (2.0 * math.pi))
+            change = jnp.where(length > longest, longest / length, 1.0) * change
             scale = jnp.maximum(jnp.maximum(*sizes), extent / (2.0 * math.pi))
             converged = residual <= CONVERGED * tolerance * scale
             converged &= ~settles & (length <= jnp.sqrt(tolerance) * scale)
-            rests = extent <= CONVERGED * tolerance * jnp.maximum(scale, jnp.max(jnp.abs(start), axis=0))
+            rests = extent <= CONVERGED * tolerance * jnp.maximum(scale, own)
             rests &= new.in_motion & (not is_timed)
             misses = ~is_sound | (~converged & (old.count >= MOST_NEWTON))
             reason = jnp.select([is_bad, new.reason > 0, rests, misses], [old.reason, new.reason, 4, 3], 0)
@@ -505,9 +513,10 @@ def periodic_orbit(
     a part of the angular velocity. The section of a scene must not tell apart shifted motions, and the axis of a top must
     lean there. A top that precesses steadily is at rest up to a shift, and no orbit; `tippe.steady` has these motions.
 
-    If a quantity is conserved or the motion can be shifted, orbits form families, and Newton's method takes the shortest step,
-    to an orbit of the family near the guess. Derivatives, also by the start, are then those at a start on an orbit, such as the
-    `state` of an `Orbit`, and NaN for other starts.
+    A step of Newton's method is at most as long as half the size of the guess or of its orbit; the text of an `Orbit` says how
+    far it is away from the guess. If a quantity is conserved or the motion can be shifted, orbits form families, and Newton's
+    method takes the shortest step, to an orbit of the family near the guess. Derivatives, also by the start, are then those at
+    a start on an orbit, such as the `state` of an `Orbit`, and NaN for other starts.
 
     **Arguments:**
 
@@ -517,6 +526,7 @@ def periodic_orbit(
       (guesses, components), or twice (guesses, coordinates) for an `AbstractSystem`, or are a list of launches.
     - `event`, `direction`: the section, as for `crossings`; by default the event of the `Hybrid`. A scene needs an `event`.
     - `period`: the period [s] of a driven system, in place of a section. The drive begins at time 0, and repeats after it.
+      The orbit may also repeat after a part of this period.
     - `free`: names of the components that Newton's method changes, such as `["y0"]`; by default all. The others must be
       those of an orbit: a guess that is off the section is moved onto it only if all are free.
     - `symmetry`: function of the state at a return that maps it to the start of the next period, for orbits that repeat up to a

@@ -215,6 +215,11 @@ def turning(t, y):
     return y[1]
 
 
+def amplitude(state):
+    """The greatest angle of a pendulum with a length of 1 m."""
+    return np.arccos(np.cos(state[0]) - state[1] ** 2 / (2.0 * GRAVITY))
+
+
 def test_an_orbit_of_a_family():
     orbit = periodic_orbit(Pendulum(), ([1.0], [0.0]), turning)
     exact = 4.0 * np.sqrt(1.0 / GRAVITY) * ellipk(np.sin(0.5 * float(orbit.state[0])) ** 2)
@@ -232,6 +237,14 @@ def test_an_orbit_of_a_family():
     driven = periodic_orbit(Pendulum(), ([1.0], [0.0]), period=float(orbit.period))
     assert driven.family == 1
     assert driven.stable
+    # Full steps lead to an orbit a turn away; the amplitude of this one is 0.849.
+    near = periodic_orbit(Pendulum(), ([0.5], [0.0]), period=2.1)
+    np.testing.assert_allclose(
+        4.0 * np.sqrt(1.0 / GRAVITY) * ellipk(np.sin(0.5 * amplitude(near.state)) ** 2), 2.1, rtol=1e-9
+    )
+    assert np.abs(near.state[0]) < 0.85
+    distance = np.max(np.abs(near.state - jnp.array([0.5, 0.0])))
+    assert f", {distance:.2g} away from the guess" in repr(near)
 
 
 def test_derivatives_of_a_family_by_the_start_and_a_number():
