@@ -428,6 +428,9 @@ RESERVE = 0.04
 #: The greatest distance of a goal [wheelbases]: the splines of a plan cannot end a longer drive exactly.
 FARTHEST = 1e5
 
+#: A footprint nearer to an obstacle than this touches it, in units of its length.
+TOUCHING = 1e-9
+
 #: A mean speed [m/s] above which the place of a goal is suspected to be in another unit.
 FASTEST = 50.0
 
@@ -739,12 +742,14 @@ def checked_problem(
     for owner, part, name in (("launch", launch, "steering"), ("launch", launch, "speed"), ("goal", goal, "speed")):
         low, high = limits.ranges().get(name, (None, None))
         require(getattr(part, name), f"{owner}.{name}", at_least=low, at_most=high, why=why)
+    length = float(footprint.length)
     for name, gaps in problem.gaps_at_ends.items():
-        if gaps.min(initial=np.inf) <= 0.0:
-            nearest = int(np.argmin(gaps))
+        if (gap := gaps.min(initial=np.inf)) <= TOUCHING * length:
+            obstacle = f"obstacles[{np.argmin(gaps)}]"
+            met = f"touches {obstacle}" if gap > -TOUCHING * length else f"overlaps {obstacle} by {-gap:.3g} m"
             place = ", ".join(f"{float(number):g}" for number in getattr(problem, name).place)
             raise ValueError(
-                f"{name}: at place = ({place}) the footprint overlaps obstacles[{nearest}] by {abs(gaps[nearest]):.3g} m: "
-                f"move the {name} or the obstacle, or pass a smaller footprint"
+                f"{name}: at place = ({place}) the footprint {met}: move the {name} or the obstacle by "
+                f"{RESERVE * length - gap:.2g} m, or pass a smaller footprint"
             )
     return problem

@@ -559,6 +559,20 @@ def test_a_planner_is_for_its_kind_of_ground_and_its_wheelbase():
         stroller.plan(longer, launch, goal, 9.0, planner=planner, progress=False)
 
 
+@pytest.mark.parametrize(
+    ("place", "met"), [(1.7, r"touches obstacles\[0\]"), (1.6, r"overlaps obstacles\[0\] by 0.1 m")]
+)
+def test_a_goal_that_touches_an_obstacle_is_free_after_the_stated_move(place, met):
+    wall, words = (
+        stroller.Box((1.1, 0.0), (1.0, 0.5)),
+        rf"the footprint {met}: move the goal or the obstacle by (\S+) m",
+    )
+    with pytest.raises(ValueError, match=words) as refused:
+        checked_problem(SCENE, START, stroller.Goal((place, 0.0), 0.0), 12.0, [wall], footprint=FOOTPRINT)
+    moved = place + float(re.search(words, str(refused.value))[1])
+    checked_problem(SCENE, START, stroller.Goal((moved, 0.0), 0.0), 12.0, [wall], footprint=FOOTPRINT)
+
+
 def test_a_tracker_needs_a_plan_on_its_ground():
     with pytest.raises(ValueError, match=r"plan = .* must be a Plan, as stroller.plan returns it"):
         stroller.track(SCENE, SCENE)
