@@ -60,6 +60,15 @@ def test_a_coordinate_of_the_place_does_not_lend_its_unit_to_the_friction():
     assert labels(["launch.place[0]"])["launch.place[0]"][:2] == ("mu", "rad")
 
 
+def test_the_stem_follows_the_centre_of_mass_unless_its_offset_grows_too():
+    # As the documentation of `Top.offset` says.
+    top, grown = stem_top(), {"body.offset": 0.0065, "stem.offset": 0.0225}
+    assert (top.offset, top.stem.offset) == (0.006, 0.022)
+    for values, distance in (({"body.offset": 0.0065}, 0.0155), (grown, 0.016)):
+        body = with_numbers({"scene": tippe.Scene(top, contact="hybrid")}, values)["scene"].body
+        assert float(body.stem.offset - body.offset) == pytest.approx(distance, abs=1e-15)
+
+
 def test_a_number_is_replaced_by_the_end_of_its_name():
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
     assert with_numbers({"scene": scene}, {"mu": 0.9})["scene"].friction.mu == 0.9

@@ -219,7 +219,7 @@ class Stem(Bounded):
     **Arguments:**
 
     - `radius`: radius of the sphere [m], positive.
-    - `offset`: distance of its centre from the centre of mass, along e [m], positive.
+    - `offset`: distance of its centre from the centre of mass, along e [m], positive; not from the sphere's centre.
 
     **Raises:** `ValueError` for numbers outside these ranges.
 
@@ -254,7 +254,10 @@ class Top(AbstractBody):
 
     - `mass`: mass [kg], positive.
     - `radius`: radius of the sphere [m], positive.
-    - `offset`: distance of the centre of mass from the sphere's centre [m], at least 0 and less than `radius`.
+    - `offset`: distance of the centre of mass from the sphere's centre [m], at least 0 and less than `radius`. The stem is
+      stated from the centre of mass: in a table or a fit over `offset` alone, it moves along the sphere by as much, and its
+      distance from the sphere's centre, `stem.offset` - `offset`, changes. For a stem that stays on the sphere, let
+      `stem.offset` grow by as much, in the columns of a table with `scattered=True`; in a fit, free it too.
     - `I1`: transverse moment of inertia about the centre of mass [kg m^2], positive.
     - `I3`: axial moment of inertia [kg m^2], positive and at most 2 `I1`, as for every rigid body.
     - `stem`: a `Stem`, or `None`. Its centre must be farther along e than the sphere's centre, and neither sphere may
