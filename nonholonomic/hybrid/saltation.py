@@ -26,8 +26,7 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ..derivatives import VariationalProblem, in_groups, tangents_of
-from ..derivatives.variation import delay, where_active
+from ..derivatives.variation import VariationalProblem, delay, in_groups, tangents_of, where_active
 from ..integration import AbstractPassive, AbstractProblem, ExtendedProblem, Lanes, Settings, States
 from ..integration.problem import CROSSED, REACHED_END
 from ..integration.scheduler import Numbers

@@ -23,10 +23,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.components import over_cells
 from ..compilation.xla_cpu import compiled_alone
-from ..derivatives import SampledRun, in_groups, tangents_of
 from ..derivatives.adjoint import SampledCotangents, mixture, samples_pulled_back, there_and_back
-from ..derivatives.sampled_runs import AbstractSampling, Options, Sampled, solve_for_samples
-from ..derivatives.variation import Tangent, by_active, where_active, with_cells
+from ..derivatives.sampled_runs import AbstractSampling, Options, Sampled, SampledRun, solve_for_samples
+from ..derivatives.variation import Tangent, by_active, in_groups, tangents_of, where_active, with_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, Settings, States, solve_with_samples
 from ..integration.problem import LEFT_DOMAIN, REACHED_END, RUNNING
 from ..integration.samples import Times

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
-from ..derivatives import exponent_of, growth
-from ..derivatives.variation import in_stretches, orthonormalised
+from ..derivatives.variation import exponent_of, growth, in_stretches, orthonormalised
 from ..hybrid import HybridOutcome, solve_hybrid
 from ..hybrid.ensemble import Modes
 from ..hybrid.saltation import with_variations

@@ -20,8 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.components import over_cells
 from ..compilation.xla_cpu import compiled_alone, greatest, written_in_place
-from ..hybrid import MOST_ROUNDS
-from ..hybrid.ensemble import after_reset, after_solve, all_rounds, at_start, time_left
+from ..hybrid.ensemble import MOST_ROUNDS, after_reset, after_solve, all_rounds, at_start, time_left
 from ..integration import AbstractProblem, Lanes, LaneState, Outcome, Settings, States
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, Status
 from ..integration.scheduler import InLanes, LaneScheduler, Recorder, Tried, of_cells

@@ -19,9 +19,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from ..compilation.components import over_lanes
 from ..compilation.tracing import dependent_outputs, is_elementary, with_own_numbers
 from ..derivatives import AbstractDifferentiableSolve, differentiable_solve, solve_ensemble_with_tangents, tangents_by
-from ..hybrid import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid, solve_hybrid_with_tangents
-from ..hybrid.ensemble import Count
-from ..hybrid.saltation import UNMEASURED, Clock
+from ..hybrid.ensemble import AbstractBatchedMode, Count, HybridOutcome, Transition, solve_hybrid
+from ..hybrid.saltation import UNMEASURED, Clock, solve_hybrid_with_tangents
 from ..integration import AbstractProblem, ExtendedProblem, Lanes, Outcome, Settings, States, solve_ensemble
 from ..integration.problem import CROSSED, REACHED_END, RUNNING, Status, legal_run
 from ..kernels import by_kernel, solve_in_modes, solve_smooth, solve_smooth_with_tangents

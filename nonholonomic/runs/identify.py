@@ -16,12 +16,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..compilation.xla_cpu import greatest
-from ..identification import AbstractRecording, Free, Identification, LogDensity, Measurements, Quantities, as_quantity
-from ..identification.posterior import Prior, as_free, own_name
-from ..identification.recording import AbstractData, numbered
-from ..identification.result import check_search, most_likely
-from ..integration import Settings
-from ..integration.problem import MOST_STEPS, tolerance_bound
+from ..identification.posterior import Free, LogDensity, Measurements, Prior, as_free, own_name
+from ..identification.recording import AbstractData, AbstractRecording, Quantities, as_quantity, numbered
+from ..identification.result import Identification, check_search, most_likely
+from ..integration.problem import MOST_STEPS, Settings, tolerance_bound
 from ..parameters import full_name, require_apart
 from ..sweeps.running import workers
 from ..terminal import status_line

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from ..hybrid import AbstractBatchedMode, HybridOutcome
-from ..hybrid.ensemble import OnlyMode
+from ..hybrid.ensemble import AbstractBatchedMode, HybridOutcome, OnlyMode
 from ..integration import AbstractProblem, Outcome, Settings, explicit_tableau
 from ..integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, UNRESOLVED, Status, run_bounds
 from ..parameters import Parameters, full_name, numbers, numbers_of, with_numbers

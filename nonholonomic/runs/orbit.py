@@ -23,8 +23,7 @@ from ..derivatives.variation import delay
 from ..geometry.vector import nearest_turn
 from ..hybrid import solve_hybrid
 from ..hybrid.saltation import VariationalMode, along, with_variations
-from ..integration import Settings
-from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESOLVED
+from ..integration.problem import CROSSED, FAILED, REACHED_END, TIGHTEST, UNRESOLVED, Settings
 from ..parameters import Parameters, as_one
 from ..terminal import status_line
 from ..text import described, shown

@@ -14,10 +14,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from ..compilation.xla_cpu import compiled_alone, compiled_for_one
 from ..derivatives import SampledRun, sampled_run
 from ..hybrid import HybridOutcome, hybrid_samples, solve_hybrid_with_samples
-from ..integration import AbstractProblem, Outcome, Settings, solve_with_samples
-from ..integration.problem import Status, legal_run, require_times
-from ..integration.samples import Times
-from ..integration.scheduler import of_cells
+from ..integration.problem import AbstractProblem, Settings, Status, legal_run, require_times
+from ..integration.samples import Times, solve_with_samples
+from ..integration.scheduler import Outcome, of_cells
 from ..kernels import by_kernel, solve_smooth_with_samples
 from ..sweeps import Axis, Variable
 from ..terminal import status_line

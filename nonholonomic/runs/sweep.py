@@ -18,8 +18,7 @@ from jaxtyping import Array, PyTree
 
 from .. import sweeps
 from ..compilation.xla_cpu import programs_in
-from ..integration import Settings
-from ..integration.problem import DEFAULT_MAX_STEPS, Status, require_times
+from ..integration.problem import DEFAULT_MAX_STEPS, Settings, Status, require_times
 from ..kernels import CELLS_OF_KERNEL, chosen_gpu, place_of_jax, require_device
 from ..sweeps import Axis, Quantity, Table, Variable, axis, cells_to_check, chunk_for, scattered_cells, size_of
 from ..sweeps.grid import EQUATIONS, FOR_A_TIME, REMARK, SHOWN_IN, columns

@@ -14,8 +14,7 @@ from ..hybrid import HybridOutcome
 from ..integration import Outcome, Settings, solve_by_diffrax
 from ..integration.problem import TIGHTEST, TIGHTEST_IN_SINGLE, Status
 from ..kernels import place_of_jax
-from ..sweeps import Axis, Variable
-from ..sweeps.grid import Values
+from ..sweeps.grid import Axis, Values, Variable
 from ..validation import as_number
 from .event import SILENT, Ensemble, counted, status_of
 from .model import AbstractModel, Number

@@ -17,10 +17,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from .. import views
 from ..compilation.tracing import named_errors
-from ..hybrid import MOST_ROUNDS, HybridOutcome, hybrid_resets
-from ..hybrid.ensemble import OnlyMode
-from ..integration import AbstractProblem, Settings
-from ..integration.problem import CROSSED, Status, run_bounds
+from ..hybrid.ensemble import MOST_ROUNDS, HybridOutcome, OnlyMode, hybrid_resets
+from ..integration.problem import CROSSED, AbstractProblem, Settings, Status, run_bounds
 from ..parameters import of_all_modes
 from ..sweeps import Quantity, Table, Tabular, run_table
 from ..terminal import status_line

@@ -26,9 +26,8 @@ from ..runs.trajectory import Trajectory, drawn_stage, frame_of, live_run, page_
 from ..sweeps import Axis, Quantity, Variable
 from ..text import counted, name_of, shown
 from ..validation import as_number, is_traced
-from ..views import Stage
 from ..views.explore import Frame, LiveRun
-from ..views.stage import Draw
+from ..views.stage import Draw, Stage
 from . import mechanics
 from .engine import ROUND_OFF, BatchedMode, time_and_state
 from .form import Event, Form, Hybrid, arguments_in_words, check_start, is_pair, require_event
