@@ -47,7 +47,7 @@ from .runs.identify import identify as identify
 from .runs.identify import log_density as log_density
 from .runs.orbit import periodic_orbit as periodic_orbit
 from .runs.simulate import simulate as simulate
-from .runs.sweep import sweep as sweep
+from .runs.table import sweep as sweep
 from .runs.trajectory import Trajectory as Trajectory
 from .runs.trajectory import explore as explore
 from .sweeps import Table as Table

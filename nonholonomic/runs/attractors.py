@@ -26,8 +26,8 @@ from ..validation import Bound, explaining, require_outside, require_whole, warn
 from .crossings import crossings
 from .event import UNMEASURED, Event, modes_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, check_run, model_of, settings_for_lanes
-from .simulate import Samples, Solved
-from .sweep import Options, require_names, table_of
+from .simulate import Samples, Solved, require_names
+from .table import Options, table_of
 
 # Lyapunov exponents: whether nearby runs diverge exponentially, and how fast.
 

@@ -30,8 +30,8 @@ from ..text import shown
 from ..validation import explaining, require_outside, require_whole
 from .event import Event, counted, modes_of, near_zero, problem_of
 from .model import AbstractModel, AbstractSceneModel, check_horizon, model_of, require_event
-from .simulate import Samples, Solved, mode_at, nan_where, own_axis
-from .sweep import Options, require_names, table_of
+from .simulate import Samples, Solved, mode_at, nan_where, own_axis, require_names
+from .table import Options, table_of
 
 #: A crossing within this fraction of the time in a mode before the end of the mode is at its end: the event function vanishes
 #: with the margin of the mode.

@@ -18,8 +18,9 @@ from ..integration.problem import AbstractProblem, Settings, Status, legal_run, 
 from ..integration.samples import Times, solve_with_samples
 from ..integration.scheduler import Outcome, of_cells
 from ..kernels import by_kernel, solve_smooth_with_samples
-from ..sweeps import Axis, Variable
+from ..sweeps import Axis, Quantity, Variable
 from ..terminal import status_line
+from ..text import likely, shown
 from ..validation import as_known, as_number, explaining, is_traced, nan_unless, warn
 from .event import counted, modes_of, problem_of
 from .model import AbstractModel, Names, Number, Start, check_run, model_of, run_of, settings_for_lanes
@@ -87,6 +88,28 @@ class Samples:
             run, _ = solve_hybrid_with_samples(*start, times, *horizon, counters=counters)
             status, values = _read_samples(cells, names, times, run, settings.tolerance)
         return status, jax.tree.map(np.asarray, values)
+
+
+def samples_of(known: dict[str, Quantity], times: Any, quantities: Any, t1: Number | None) -> Samples | None:
+    """The samples of a table, checked. **Arguments:** `known`: the quantities of the model."""
+    if times is None and not len(quantities):
+        return None
+    if times is None or isinstance(quantities, str) or not isinstance(quantities, Sequence) or not quantities:
+        raise ValueError(f"quantities = {shown(quantities)} must be a list of names, with the times to sample them")
+    require_names(known, quantities)
+    require_times(as_number(times), t1)
+    return Samples(np.asarray(times, float), tuple(quantities))
+
+
+def require_names(known: dict[str, Quantity], quantities: Sequence[str]) -> None:
+    """Raise `ValueError` unless this is a list of names of quantities, each named once."""
+    if isinstance(quantities, str) or not isinstance(quantities, Sequence):
+        raise ValueError(f"quantities = {shown(quantities)} must be a list of names")
+    for name in quantities:
+        if name not in known:
+            raise ValueError(f"quantities: {shown(name)} must be one of {', '.join(known)}{likely(name, known)}")
+        if list(quantities).count(name) > 1:
+            raise ValueError(f"quantities: {shown(name)} must be named only once")
 
 
 class OfOneRun(eqx.Module):

@@ -25,8 +25,7 @@ from nonholonomic.parameters import description, meant, numbers
 from nonholonomic.runs.event import EventFunction, with_clock, with_event
 from nonholonomic.runs.identify import Data, FreeNumbers, Priors, fit_runs, posterior_of_runs
 from nonholonomic.runs.model import AbstractModel, AbstractSceneModel, Names, Number, model_of, run_of, statuses
-from nonholonomic.runs.sweep import Options, table_of
-from nonholonomic.runs.table import TableForm
+from nonholonomic.runs.table import Options, TableForm, table_of
 from nonholonomic.sweeps import Table, Variable
 from nonholonomic.terminal import status_line
 from nonholonomic.text import is_array, is_users, name_of, parted, shown

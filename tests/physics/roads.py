@@ -18,7 +18,8 @@ import tippe
 from nonholonomic.compilation.xla_cpu import compile_quickly
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
-from nonholonomic.runs.table import WORDS, TableJob, errors_of, other_tolerances
+from nonholonomic.runs.table import WORDS, TableJob
+from nonholonomic.sweeps.table import errors_of, other_tolerances
 from tippe.runs.model import INVERSIONS, TopModel
 
 ANGLE, TOLERANCE = 0.95 * np.pi, 1e-9

@@ -9,17 +9,16 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings
-from nonholonomic.runs.table import (
+from nonholonomic.runs.table import WORDS, TableJob
+from nonholonomic.sweeps.table import (
     FINER,
     SAFETY,
     SAFETY_OF_HISTORIES,
-    WORDS,
-    TableJob,
+    concise,
     error_bound,
     errors_of,
     other_tolerances,
 )
-from nonholonomic.sweeps.table import concise
 from tippe import steady
 from tippe.runs.model import INVERSIONS, TopModel
 

@@ -29,8 +29,16 @@ from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.runs.attractors import LyapunovExponent, exponent_of_model
 from nonholonomic.runs.event import EventTime, time_of_event
 from nonholonomic.runs.model import Number, check_horizon, settings_for_lanes
-from nonholonomic.runs.sweep import Options, check_cells, compute_table, full_axes, full_sensitivities, samples_of
-from nonholonomic.runs.table import TableForm, TableJob
+from nonholonomic.runs.simulate import samples_of
+from nonholonomic.runs.table import (
+    Options,
+    TableForm,
+    TableJob,
+    check_cells,
+    compute_table,
+    full_axes,
+    full_sensitivities,
+)
 from nonholonomic.sweeps import Axis, Table, axis
 from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, shown, unit_of

@@ -7,7 +7,7 @@ import pytest
 from close import assert_close
 
 from nonholonomic.integration import Settings
-from nonholonomic.runs.table import other_tolerances
+from nonholonomic.sweeps.table import other_tolerances
 
 
 def test_a_tolerance_is_bounded_by_the_precision_with_a_warning():

@@ -18,8 +18,7 @@ import tippe
 from nonholonomic import AbstractMode, Hybrid, sweep
 from nonholonomic.integration import Settings
 from nonholonomic.runs.model import model_of
-from nonholonomic.runs.sweep import checksum_of, has_users_code
-from nonholonomic.runs.table import TableForm, TableJob
+from nonholonomic.runs.table import TableForm, TableJob, checksum_of, has_users_code
 
 HEIGHTS, RESTITUTIONS = np.array([0.5, 1.0, 2.0]), np.array([0.7, 0.8])
 BALL = Hybrid([Ball()], event=Bounces(3.0))
