@@ -95,7 +95,10 @@ class AbstractDifferentiableSolve(AbstractSolve):
         raise NotImplementedError
 
     def pull_back(self, active: tuple[int, ...], cells: int, leaves: Leaves, cotangents: Primal) -> Gradient:
-        """The cotangents of the active leaves in every cell, from those of the primal, `None` for parts without one."""
+        """The cotangents of the active leaves in every cell, from those of the primal, `None` for parts without one.
+
+        **Raises:** `ValueError` if there is no backward pass; then the derivatives with respect to every leaf take its place.
+        """
         raise NotImplementedError
 
 
@@ -357,7 +360,12 @@ class LinearSolve(AbstractSolve):
             return self.of.push_forward(self.active, cells, leaves, last)
         cotangents = dict(zip(self.parts, last, strict=True))
         by_part = jax.tree.unflatten(self.structure, [cotangents.get(k) for k in range(self.structure.num_leaves)])
-        return self.of.pull_back(self.active, cells, leaves, by_part)
+        try:
+            return self.of.pull_back(self.active, cells, leaves, by_part)
+        except ValueError:
+            # A loop without a fixed number of iterations has no backward pass.
+            slopes = self.of.value_and_tangents(self.active, False, cells, *leaves)[1]
+            return [contracted(slope, by_part) for slope in slopes]
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
         return dataclasses.replace(self, of=self.of.for_parts(wanted)) if self.parts is None else self
@@ -384,6 +392,17 @@ class LinearSolve(AbstractSolve):
         if not any(request.batch_flags):
             return [part[None] for part in of_cell(*arguments)]
         return jax.vmap(of_cell, tuple(0 if flag else None for flag in request.batch_flags))(*arguments)
+
+
+def contracted(slope: Primal, cotangents: Primal) -> Float[Array, "cells ..."]:
+    """The derivative of a sum over the primal in every cell, from the derivative of the primal, the axes of the leaf last, and
+    its cotangents; a derivative that is zero counts for nothing, whatever the cotangent."""
+    total = jnp.zeros(())
+    for part, cotangent in zip(flat(slope)[0], flat(cotangents)[0], strict=True):
+        if part is not None and cotangent is not None:
+            weights = cotangent.reshape(*cotangent.shape, *[1] * (part.ndim - cotangent.ndim))
+            total += jnp.where(part == 0.0, 0.0, part * weights).sum(axis=tuple(range(1, cotangent.ndim)))
+    return total
 
 
 def product(slope: Float[Array, "..."], tangent: Float[Array, "..."]) -> Float[Array, "..."]:

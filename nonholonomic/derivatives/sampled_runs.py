@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
@@ -12,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..integration import AbstractProblem, CoreProblem, Outcome, Settings, States, sample, solve_with_samples
+from ..integration import AbstractProblem, CoreProblem, Outcome, Settings, sample, solve_with_samples
 from ..integration.problem import LEFT_DOMAIN, event_time
 from ..validation import as_number
 from .adjoint import SampledCotangents, samples_pulled_back
@@ -57,20 +56,8 @@ class AbstractSampling(AbstractDifferentiableSolve):
     def sampled(self, built: PyTree, tangents: Tangents, options: Options, nested: bool) -> tuple[PyTree, list[PyTree]]:
         """The samples, and their derivative along each tangent, the cells first; `nested`: as for `value_and_tangents`."""
 
-    def evaluated(self, built: PyTree) -> list[tuple[Callable[..., PyTree], PyTree, States]]:
-        """What the backward pass differentiates: functions of what is run and of its states, and both arguments."""
-        return []
-
     def prefers_adjoint(self, active: tuple[int, ...], leaves: Leaves) -> bool:
-        if sum(leaves[k].size for k in active) <= self.most_forward:
-            return False
-        typed = [jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
-        # A loop without a fixed number of iterations has no backward pass.
-        try:
-            jax.eval_shape(functools.partial(_backward, self), *typed)
-        except ValueError:
-            return False
-        return True
+        return sum(leaves[k].size for k in active) > self.most_forward
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
@@ -117,20 +104,6 @@ class AbstractSampling(AbstractDifferentiableSolve):
             return self.built(modules, settings.tolerance, cells)
 
         return build, tuple(numbers), (times, t1, settings, grid), cells if self.in_blocks else None
-
-
-# Compiled, so that JAX traces it once for equal solves.
-@eqx.filter_jit
-def _backward(sampling: AbstractSampling, *leaves: Array) -> list[PyTree]:
-    """The backward passes of the functions of a single run, for their shapes. **Raises:** `ValueError` if there is none."""
-    build, numbers, *_ = sampling.builder(1, leaves)
-
-    def pulled_back(function: Callable[..., PyTree], run: PyTree, state: States) -> PyTree:
-        arrays, static = eqx.partition(run, eqx.is_inexact_array)
-        values, pull = jax.vjp(lambda arrays, state: function(eqx.combine(arrays, static), state), arrays, state)
-        return pull(jax.tree.map(jnp.ones_like, values))
-
-    return [pulled_back(*part) for part in sampling.evaluated(build(numbers, 1))]
 
 
 def _cells_last(number: Float[Array, "..."], axes: int, cells: int) -> Float[Array, "..."]:
@@ -331,12 +304,6 @@ class BlockSampling(AbstractSampling):
         arguments = (variational, times, t1, jnp.asarray(built.start()[0].shape[1]), settings)
         samples = solve_with_samples(*arguments, n_blocks=1 + len(tangents), one_kernel=not nested)
         return _with_slopes(variational, *samples)
-
-    def evaluated(self, built: AbstractProblem) -> list[tuple[Callable[..., PyTree], PyTree, States]]:
-        def rates(problem: AbstractProblem, state: States) -> States:
-            return problem.field(jnp.zeros_like(state[0]), state)
-
-        return [(rates, built, built.start()[0])]
 
     def pull_back(self, active: tuple[int, ...], cells: int, leaves: Leaves, cotangents: SampledRun) -> Gradient:
         solve = dataclasses.replace(self, core_only=True) if cotangents.quadratures is None else self

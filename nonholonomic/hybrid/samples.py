@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ..compilation.components import over_cells
 from ..compilation.xla_cpu import compiled_alone
 from ..derivatives.adjoint import SampledCotangents, mixture, samples_pulled_back, there_and_back
+from ..derivatives.differentiable import contracted
 from ..derivatives.sampled_runs import AbstractSampling, Options, Sampled, SampledRun, solve_for_samples
 from ..derivatives.variation import Tangent, by_active, in_groups, tangents_of, where_active, with_cells
 from ..integration import AbstractProblem, Components, Jumps, Lanes, Settings, States, solve_with_samples
@@ -376,20 +377,12 @@ class HybridSampling(AbstractSampling):
         tangents, settings = tuple((tangent[0], tangent[2]) for tangent in tangents), options[2]
         return sampled_with_tangents(built, tangents, options[:2], built[2].shape[1], settings, self.counters)
 
-    def evaluated(self, built: Built) -> list[tuple[Callable[..., PyTree], PyTree, States]]:
-        def values(mode: AbstractBatchedMode, state: States) -> PyTree:
-            shown = over_cells(lambda mode, states: mode.shown(states), mode)(state[:, None])
-            return mode.problem(state).field(jnp.zeros_like(state[0]), state), shown
-
-        modes, _, state = built
-        return [(values, modes[group[0]], state) for group in ensemble.program_groups(modes)]
-
     def pull_back(
         self, active: tuple[int, ...], cells: int, leaves: tuple[Array, ...], cotangents: SampledRun
     ) -> list[Lanes]:
         if cells == 1 and len(active) <= MOST_FORWARD_ALONE:
             slopes = self.value_and_tangents(active, False, cells, *leaves)[1]
-            return [_product(slope, cotangents) for slope in slopes]
+            return [contracted(slope, cotangents) for slope in slopes]
         build, numbers, (times, t1, settings, _), _ = self.builder(cells, leaves)
         rebuilt, point = by_active(build, active, numbers, cells)
         times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells))
@@ -400,14 +393,6 @@ class HybridSampling(AbstractSampling):
         end_time = jnp.zeros(cells) if end_time is None else end_time
         options = (times, jnp.broadcast_to(t1, (cells,)), settings, self.counters)
         return hybrid_samples_pulled_back(rebuilt, point, shown.T, end_time, *options)
-
-
-def _product(slope: SampledRun, cotangents: SampledRun) -> Lanes:
-    """The derivative of a sum over samples, from their derivatives and their cotangents; a derivative that is zero counts
-    for nothing, whatever the cotangent."""
-    pairs = ((slope.states, cotangents.states), (slope.end_time, cotangents.end_time))
-    terms = [weighted(one, other).reshape(len(one), -1) for one, other in pairs if other is not None]
-    return sum((jnp.sum(term, axis=1) for term in terms), jnp.zeros(len(slope.end_time)))
 
 
 # The backward pass.

@@ -141,6 +141,32 @@ def test_an_infinite_cotangent_of_a_number_at_rest_has_no_effect():
     assert_close(gradients, [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], atol=1e-12)
 
 
+class SummedRate(Decays):
+    """The rate is added up in a loop that has no backward pass."""
+
+    def field(self, time, state):
+        def added(carry):
+            return carry[0] + 0.5 * self.numbers[0], carry[1] + 1
+
+        rate, _ = jax.lax.while_loop(lambda carry: carry[1] < 2, added, (jnp.zeros_like(state[0]), 0))
+        growth = self.numbers[2]
+        return jnp.stack([-rate * (1.0 + growth * time) * state[0], jnp.ones_like(state[0]), state[0]])
+
+
+def test_a_loop_without_a_backward_pass_is_differentiated_forward():
+    def build_summed(numbers, cells):
+        return SummedRate(build(numbers, cells).numbers)
+
+    def height(rate, start, growth):
+        run = sampled_run(build_summed, (rate, start, growth, 9.0), TIMES, jnp.asarray(2.0), Settings(1e-9))
+        return run.states[2, 0]
+
+    rate, start, growth = points = jnp.array([[1.0, 0.3], [2.0, 1.5], [0.7, -0.2]])
+    slopes = jax.jit(jax.vmap(jax.grad(height, (0, 1, 2))))(*points)
+    end = start * jnp.exp(-rate * (1.0 + 0.5 * growth))
+    assert_close(slopes, [-(1.0 + 0.5 * growth) * end, end / start, -0.5 * rate * end], rtol=1e-7)
+
+
 class DampedOscillator(AbstractProblem):
     """y'' = -damping y' - 25 y from y = height, at rest for height 0."""
 
