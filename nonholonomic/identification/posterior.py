@@ -729,10 +729,6 @@ class LogDensity(eqx.Module):
     def __call__(self, coordinates: Float[Array | np.ndarray, " unknowns"]) -> Float[Array, ""]:
         return self.of_prediction(jnp.asarray(coordinates), self.predict(jnp.asarray(coordinates)[None])[0])
 
-    def log_priors(self, coordinates: Float[Array | np.ndarray, "rows unknowns"]) -> Float[Array, " rows"]:
-        """The log prior densities at several sets of coordinates."""
-        return self.problem.unknowns.log_priors(coordinates)
-
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
         """The log density at given coordinates, for given predictions of the model."""
         log_prior = self.problem.unknowns.log_prior(coordinates)
