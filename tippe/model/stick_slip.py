@@ -9,6 +9,7 @@ error within the tolerance (`tests/physics/test_stick_slip.py`).
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.polynomial import Polynomial, legendre
 
 from nonholonomic.compilation.xla_cpu import greatest
-from nonholonomic.geometry import AbstractFrame, Vector
+from nonholonomic.geometry import AbstractFrame, Vector, solve
 from nonholonomic.integration import Components, Lanes, States
 from nonholonomic.integration.dense import halved
 
@@ -245,7 +246,11 @@ class _Contact(eqx.Module):
         # For each pair of stages: normal_j . pull_k, times the weight of stage k in stage j.
         matrix = duration * jnp.einsum("jk,ij...,ik...->jk...", WEIGHTS, normal, pull)
         matrix = matrix + jnp.eye(STAGES).reshape((STAGES, STAGES) + (1,) * (size.ndim - 1)) * size
-        turn = _solved(matrix, normal[0] * missing[0] + normal[1] * missing[1])
+        # These matrices need no pivots.
+        solved = functools.partial(solve, positive=True)
+        for _ in range(size.ndim - 1):
+            solved = jax.vmap(solved, -1, -1)
+        turn = solved(matrix, normal[0] * missing[0] + normal[1] * missing[1])
         change = missing - duration * jnp.einsum("js,is...->ij...", WEIGHTS, pull * turn)
         # The force depends only on the slip's direction, and where a slip begins, v is much smaller than the change of
         # v by a small turn of the force. So the new direction is the turned direction, not the direction of the
@@ -253,20 +258,6 @@ class _Contact(eqx.Module):
         new_direction = unit + turn * normal
         new_size = greatest(size + change[0] * unit[0] + change[1] * unit[1], 0.2 * size)
         return new_size / length(new_direction[0], new_direction[1]) * new_direction - v
-
-
-def _solved(matrix: Float[Array, "n n ..."], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Solution of a few linear equations, lane by lane, by elimination. The matrices here need no pivots."""
-    rows = jnp.arange(len(right)).reshape((-1,) + (1,) * (right.ndim - 1))
-
-    def eliminated(k, system):
-        matrix, right = system
-        row, of_row = matrix[k] / matrix[k, k], right[k] / matrix[k, k]
-        column = jnp.where(rows == k, 0.0, matrix[:, k])
-        matrix = jnp.where(rows[:, None] == k, row, matrix - column[:, None] * row)
-        return matrix, jnp.where(rows == k, of_row, right - column * of_row)
-
-    return jax.lax.fori_loop(0, len(right), eliminated, (matrix, right))[1]
 
 
 #: The remaining sliding distance at which a slip is stopped, over the tolerance and the radius. The error of the state
