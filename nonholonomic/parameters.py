@@ -210,7 +210,7 @@ def description(root: str, tree: PyTree) -> dict[str, Any]:
     return fields
 
 
-def _plain_data(value: Any) -> Any:
+def _plain_data(value: object) -> object:
     """A value as JSON can store it; other objects are described by their kind, because their text can be an address."""
     if isinstance(value, jax.Array | np.ndarray | np.generic | Numbers):
         return np.asarray(value).tolist()

@@ -135,21 +135,19 @@ class Progress:
             Progress._has_told, doing = True, "compiling, the first time only" if compiling else self._doing
             print(f"nonholonomic: {doing} (NONHOLONOMIC_PROGRESS=0 hides this line)", file=sys.stderr)
             return
-        # Without a delay, tqdm writes the line before everything in it is known.
-        options = {"delay": 1e-9, "leave": self._since is not None and not self._inner}
-        if self._since is None:
-            if self._bar is None:
-                self._bar = self._tqdm(bar_format="{desc} [{elapsed}]", **options)
-                self._bar.start_t = self._start
-            self._bar.set_description_str(words, refresh=False)
-        else:
-            if self._bar is None:
-                # The rate is that of the whole run without the preparations, because chunks of items differ in cost.
-                counts = {"total": self._total, "initial": self._first, "unit": self._unit, "smoothing": 0}
-                self._bar = self._tqdm(**counts, **options)
-                self._bar.start_t, self._bar.n = self._since, self._done
-                self._bar.set_postfix(self._notes, refresh=False)
+        counts = self._since is not None
+        if self._bar is None:
+            # The rate is that of the whole run without the preparations, because chunks of items differ in cost.
+            items = {"total": self._total, "initial": self._first, "unit": self._unit, "smoothing": 0}
+            # Without a delay, tqdm writes the line before everything in it is known.
+            options = {"delay": 1e-9, "leave": counts and not self._inner}
+            self._bar = self._tqdm(**(items if counts else {"bar_format": "{desc} [{elapsed}]"}), **options)
+            self._bar.start_t, self._bar.n = self._since or self._start, self._done
+            self._bar.set_postfix(self._notes, refresh=False)
+        if counts:
             self._bar.set_description("compiling" if compiling else None, refresh=False)
+        else:
+            self._bar.set_description_str(words, refresh=False)
         self._bar.refresh()
 
     @classmethod

@@ -193,7 +193,7 @@ class Stated(eqx.Module):
         object.__setattr__(self, "_unit", unit)
         return self
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         # Pickle could not set the attribute of a frozen module.
         return dict(vars(self))
 

@@ -225,7 +225,7 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
         values = {name: np.stack([run[name] for run in rides.values()]) for name in QUANTITIES}
         run_table(QUANTITIES, coords, values, ["ride", "time"], request).save(options.out / "rides.h5")
         files, pictures = ["rides.h5"], []
-        if views.can_draw():
+        if views.pages.can_draw():
             labels = [", ".join(name) for name in rides]
             curves = first.plot("speed", "energy", "side_force", others=others, label=labels)
             for heading, name, figure in (
@@ -234,16 +234,16 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
             ):
                 figure.savefig(options.out / name, dpi=110)
                 files.append(name)
-                pictures.append(f"<h2>{heading}</h2>{views.picture_as_html(options.out / name)}")
+                pictures.append(f"<h2>{heading}</h2>{views.pages.picture_as_html(options.out / name)}")
         audit = "\n".join([HEADING, *texts[1:]])
         plan_text, audit = (f"<pre>{escape(text)}</pre>" for text in (str(parking), audit))
         sections = "".join([*pictures[:1], plan_text, "<h2>Energy against work</h2>", audit, *pictures[1:]])
-        page = views.page_of_job(lambda: stages(parking, rides), "A stroller parks, and rides", 1.0, sections)
+        page = views.pages.page_of_job(lambda: stages(parking, rides), "A stroller parks, and rides", 1.0, sections)
         page.save(options.out / PAGE)
     return {AUDIT: "\n".join(texts).encode()} | {name: (options.out / name).read_bytes() for name in [*files, PAGE]}
 
 
-def write(options: argparse.Namespace) -> views.Outputs:
+def write(options: argparse.Namespace) -> views.pages.Outputs:
     """Write all files, computed or from an earlier run of the same options, and print the audit."""
     cache = enable_compilation_cache()
     facts = "rides", sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
@@ -257,7 +257,7 @@ def write(options: argparse.Namespace) -> views.Outputs:
             with replacing(path) as scratch:
                 scratch.write_bytes(files[name])
     page = paths.pop(PAGE)
-    return views.Outputs(2 * len(scenes(options)), list(paths.values()), page, cache if read else None)
+    return views.pages.Outputs(2 * len(scenes(options)), list(paths.values()), page, cache if read else None)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -268,7 +268,7 @@ def main(arguments: list[str] | None = None) -> int:
     **Returns:** the exit status: 0, or 2 for input that cannot be used.
     """
     options = parser().parse_args(arguments)
-    return views.run_job(lambda: write(options), "stroller")
+    return views.pages.run_job(lambda: write(options), "stroller")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 your own as a subclass of `AbstractFriction`."""
 
 import abc
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +12,9 @@ from nonholonomic.compilation.components import held, map_methods
 from nonholonomic.compilation.xla_cpu import greatest
 from nonholonomic.geometry import Component
 from nonholonomic.validation import Bound, Bounded, as_number
+
+#: A law, or a value that the checks of a scene reject.
+Other = TypeVar("Other")
 
 
 class WheelMotion(NamedTuple):
@@ -57,7 +60,7 @@ class AbstractFriction(Bounded):
     ```
     """
 
-    def __init_subclass__(cls, **options: Any):
+    def __init_subclass__(cls, **options: object):
         super().__init_subclass__(**options)
         map_methods(cls, ["drag"])
 
@@ -76,7 +79,7 @@ class AbstractFriction(Bounded):
         """
 
 
-def as_law(law: Any) -> Any:
+def as_law(law: Other) -> Other:
     """A user's law with every number of its arrays as a leaf; anything else unchanged."""
     if not isinstance(law, AbstractFriction):
         return law

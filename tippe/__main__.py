@@ -8,6 +8,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from pathlib import Path
+from statistics import median_high as middle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -98,11 +99,6 @@ def angle_counted(options: argparse.Namespace) -> float:
     return INVERTED if top.stem is None else float(top.stem_angle)
 
 
-def middle(values: list[float]) -> float:
-    """The middle one of some values."""
-    return sorted(values)[len(values) // 2]
-
-
 def described(options: argparse.Namespace) -> list[str]:
     """A description of the job, in some lines."""
     top, mm = TOPS[options.top](), lambda length: f"{1e3 * float(length):.3g} mm"
@@ -178,7 +174,7 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
         with display:
             display.begin()
             futures = {arena: threads.submit(table, options, arena, cache) for arena in ("cylinder", "plane")}
-            if not views.without_motion():
+            if not views.pages.without_motion():
                 page_facts, contents = facts(options, "page"), lambda: {"page": sliders(options).encode()}
                 live = threads.submit(kept_files, cache, page_facts, contents)
             for arena in ARENAS:
@@ -188,7 +184,7 @@ def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str,
                     print(heading, *paper.aligned(rows_of(options, tables[arena])), sep="\n", flush=True)
                 display.advance(1)
                 # Drawn while the threads compile, after the table of the plane, whose programs it uses.
-                if arena == "plane" and views.can_draw():
+                if arena == "plane" and views.pages.can_draw():
                     pictures.append(options.out / "theta.png")
                     picture(options, *theta_shown(options, cache), tables["plane"]).savefig(pictures[0], dpi=130)
                     display.advance(1)
@@ -240,7 +236,7 @@ def picture(options: argparse.Namespace, times: Times, theta: Times, plane: Tabl
     return draw_launches([panel], angle, dot if end <= times[-1] else f"Not turned over by {times[-1]:g} s.", "deg")
 
 
-def write(options: argparse.Namespace) -> views.Outputs:
+def write(options: argparse.Namespace) -> views.pages.Outputs:
     """Compute and write the tables, the picture and the page: the top with sliders if three.js is installed, the tables, and
     the picture.
 
@@ -265,13 +261,13 @@ def write(options: argparse.Namespace) -> views.Outputs:
     print(f"\n{claim} {remark(options)}", flush=True)
     sections = ""
     for arena, heading in headings(options).items():
-        rows = views.table_as_html(rows_of(options, tables[arena]), 1)
+        rows = views.pages.table_as_html(rows_of(options, tables[arena]), 1)
         sections += f"<h2>Time until it has turned over, {heading}</h2>{rows}"
     sections += "".join(f'<p class="note">{escape(line)}</p>' for line in (claim, remark(options), *described(options)))
-    sections += "".join(f"<h2>θ(t)</h2>{views.picture_as_html(path)}" for path in pictures)
+    sections += "".join(f"<h2>θ(t)</h2>{views.pages.picture_as_html(path)}" for path in pictures)
     path = options.out / "index.html"
-    views.Page((live or views.page_of_job(list, TITLE, 1.0, BELOW).html).replace(BELOW, sections)).save(path)
-    return views.Outputs(turned_over.size, [*paths.values(), *pictures], path, cache if read else None)
+    views.Page((live or views.pages.page_of_job(list, TITLE, 1.0, BELOW).html).replace(BELOW, sections)).save(path)
+    return views.pages.Outputs(turned_over.size, [*paths.values(), *pictures], path, cache if read else None)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -285,7 +281,7 @@ def main(arguments: list[str] | None = None) -> int:
     if "--paper" in arguments:
         return paper.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
-    return views.run_job(lambda: write(options), "tippe", "To see the top move")
+    return views.pages.run_job(lambda: write(options), "tippe", "To see the top move")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 returns."""
 
 import abc
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -15,6 +15,9 @@ from nonholonomic.compilation.xla_cpu import compiled_setup
 from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
 from nonholonomic.text import one_line, shown
 from nonholonomic.validation import UNTRACEABLE, Bound, Bounded, Usual, as_number, is_traced, largest, require_kind
+
+#: A law, or a value that the checks of a scene reject.
+Other = TypeVar("Other")
 
 # Argument and result of a friction law: the motion at the contact, and force and torque per unit normal force.
 
@@ -129,7 +132,7 @@ class AbstractFriction(Bounded):
         """
 
 
-def as_law(law: Any) -> Any:
+def as_law(law: Other) -> Other:
     """A user's law with every number of its arrays as a leaf; anything else unchanged."""
     if not isinstance(law, AbstractFriction):
         return law

@@ -279,22 +279,24 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[vie
     return first.stages(others, label=[f"{arena.name}, θ(0) = {theta:.4g} rad" for arena in arenas])
 
 
-def write(options: argparse.Namespace) -> views.Outputs:
+def write(options: argparse.Namespace) -> views.pages.Outputs:
     """Compute and write the tables, the picture if matplotlib is installed, and the page: two moving tops if three.js is
     installed, the tables, and the picture."""
     by_arena = tables(options)
     print("\n".join([*described(options), "", *aligned(rows_of(options, by_arena))]))
     with status_line("drawing"):
         files = [options.out / f"{arena}.h5" for arena in by_arena]
-        sections = "<h2>Inversion times</h2>" + views.table_as_html(list(map(list, rows_of(options, by_arena))), 2)
+        sections = "<h2>Inversion times</h2>" + views.pages.table_as_html(
+            list(map(list, rows_of(options, by_arena))), 2
+        )
         sections += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
-        if views.can_draw():
+        if views.pages.can_draw():
             files.append(options.out / "theta.png")
             picture(options, by_arena).savefig(files[-1], dpi=130)
-            sections += "<h2>θ(t) of every launch</h2>" + views.picture_as_html(files[-1])
+            sections += "<h2>θ(t) of every launch</h2>" + views.pages.picture_as_html(files[-1])
         path = options.out / "index.html"
-        views.page_of_job(lambda: motions(options, by_arena), "A tippe top turns over", 0.5, sections).save(path)
-    return views.Outputs(sum(table.status.size for table in by_arena.values()), files, path)
+        views.pages.page_of_job(lambda: motions(options, by_arena), "A tippe top turns over", 0.5, sections).save(path)
+    return views.pages.Outputs(sum(table.status.size for table in by_arena.values()), files, path)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -306,4 +308,4 @@ def main(arguments: list[str] | None = None) -> int:
     """
     options = parser().parse_args(arguments)
     enable_compilation_cache()
-    return views.run_job(lambda: write(options), "tippe --paper")
+    return views.pages.run_job(lambda: write(options), "tippe --paper")

@@ -11,8 +11,6 @@ from .frames import FrameMotion as FrameMotion
 from .frames import PlaneFrame as PlaneFrame
 from .frames import Pose as Pose
 from .frames import Tangent as Tangent
-from .frames import frame_of as frame_of
-from .frames import place_named as place_named
 from .level_sets import Graph as Graph
 from .level_sets import Implicit as Implicit
 from .level_sets import Paraboloid as Paraboloid
@@ -34,12 +32,9 @@ from .vector import difference as difference
 from .vector import dot as dot
 from .vector import inverse as inverse
 from .vector import multiply as multiply
-from .vector import none_if_zero as none_if_zero
-from .vector import planar_length as planar_length
 from .vector import rate_in_frame as rate_in_frame
 from .vector import scale as scale
 from .vector import solve as solve
 from .vector import stacked as stacked
 from .vector import subtract as subtract
 from .vector import sum_vectors as sum_vectors
-from .vector import tangents as tangents

@@ -14,7 +14,7 @@ Vectors are tuples of three components, each a number or an array over lanes, or
 
 import abc
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, NamedTuple, TypeAlias, TypeVar
+from typing import ClassVar, NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -92,7 +92,7 @@ class AbstractSurface(Bounded):
     ```
     """
 
-    def __init_subclass__(cls, **options: Any):
+    def __init_subclass__(cls, **options: object):
         super().__init_subclass__(**options)
         map_methods(cls, MAPPED)
 

@@ -1,16 +1,9 @@
 """Pictures, films and pages of results. The subpackages above compute the results, and use these functions to draw
 them."""
 
-from .pages import Outputs as Outputs
 from .pages import Page as Page
-from .pages import can_draw as can_draw
 from .pages import page as page
-from .pages import page_of_job as page_of_job
-from .pages import picture_as_html as picture_as_html
-from .pages import run_job as run_job
 from .pages import stage_of as stage_of
-from .pages import table_as_html as table_as_html
-from .pages import without_motion as without_motion
 from .plot import draw_fit as draw_fit
 from .stage import COLOURS as COLOURS
 from .stage import DARK as DARK
@@ -23,17 +16,8 @@ from .stage import Box as Box
 from .stage import Curve as Curve
 from .stage import Disc as Disc
 from .stage import Line as Line
-from .stage import Marks as Marks
 from .stage import Mesh as Mesh
 from .stage import Show as Show
 from .stage import Stage as Stage
 from .stage import Trace as Trace
 from .stage import Wheel as Wheel
-from .stage import arena as arena
-from .stage import ball as ball
-from .stage import bar as bar
-from .stage import box as box
-from .stage import quaternion as quaternion
-from .stage import rod as rod
-from .stage import striped as striped
-from .stage import wheel as wheel

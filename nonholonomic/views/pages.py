@@ -417,7 +417,7 @@ class Viewable:
         return page(stages, "; ".join(stage.title for stage in stages), **options)
 
 
-def require_others(run: object, others: Any) -> Sequence[Any]:
+def require_others(run: object, others: object) -> Sequence[Any]:
     """Raise `ValueError` unless the others are a list of runs that are drawn as the run is; return them."""
     if isinstance(others, type(run)):
         raise ValueError("others = a run must be a list of runs: write others=[run]")
@@ -429,7 +429,7 @@ def require_others(run: object, others: Any) -> Sequence[Any]:
     return others
 
 
-def require_labels(label: Label, runs: list[Any]) -> list[str]:
+def require_labels(label: Label, runs: Sequence[object]) -> list[str]:
     """The labels of runs, one for each. **Raises:** `ValueError` if there is another number of them."""
     labels = [label] if isinstance(label, str) else label
     if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):

@@ -110,7 +110,7 @@ def example_arguments(scene: Any, launch: Any) -> tuple[Float[Array, ""], Motion
     return jax.tree.map(lambda part: jnp.zeros((), part.dtype), eqx.filter_eval_shape(at_start, scene, launch))
 
 
-def check_input(controls: Any, scene: Any, launch: Any, jumps: Any = None) -> None:
+def check_input(controls: Any, scene: Any, launch: Any, jumps: object = None) -> None:
     """Raise `ValueError` unless an input can be called, traced by JAX, and is finite at the start of a run; warn of
     comparisons of the time whose jumps are unknown.
 
@@ -160,20 +160,20 @@ def as_jumps(jumps: Any) -> tuple[Array, ...]:
     return tuple(map(as_number, times))
 
 
-def is_searched(controls: Any) -> bool:
+def is_searched(controls: object) -> bool:
     """Whether an input is a user's, so that its comparisons of the time are searched for jumps; those of plans are smooth."""
     if isinstance(controls, Held | PerRide):
         return is_searched(controls.function)
     return is_users(type(users_input(controls)))
 
 
-def users_input(controls: Any) -> Any:
+def users_input(controls: object) -> object:
     """An input before it was traced."""
     return controls.program.function if isinstance(controls, Formula) else controls
 
 
 def jump_times(
-    controls: Any, jumps: tuple[Array, ...], t: Any, motion: Any, cells: int | None
+    controls: PyTree, jumps: tuple[Array, ...], t: Float[Array, ""], motion: Motion, cells: int | None
 ) -> Float[Array, "jumps *cells"] | None:
     """The times at which an input may jump: those given, and those of its comparisons of the time; `None` if there are none.
 
@@ -204,7 +204,7 @@ class Formula(eqx.Module):
     program: TracedFunction = eqx.field(static=True)
 
     @classmethod
-    def of(cls, controls: Any, t: Any, motion: Any) -> "Formula":
+    def of(cls, controls: Input, t: Float[Array, ""], motion: Motion) -> "Formula":
         """The formula of a function, with arguments such as these."""
         closed = jax.make_jaxpr(lambda *arguments: tuple(map(as_number, controls(*arguments))))(t, motion)
         return cls(tuple(closed.consts), TracedFunction(controls, with_constants_first(closed)))
@@ -234,7 +234,7 @@ class PerRide(eqx.Module):
     by_elements: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, controls: Any, t: Any, motion: Any) -> "PerRide":
+    def of(cls, controls: PyTree, t: Float[Array, ""], motion: Motion) -> "PerRide":
         """The input of a single ride, with arguments such as these."""
         arrays, static = eqx.partition(controls, eqx.is_inexact_array)
         if sum(leaf.size for leaf in jax.tree.leaves(arrays)) > MOST_ELEMENTS:
@@ -252,7 +252,7 @@ class PerRide(eqx.Module):
     def of_cells(self, cells: int) -> "PerRide":
         """The same input for a number of rides."""
 
-        def spread(leaf: Any) -> Any:
+        def spread(leaf: PyTree) -> PyTree:
             is_array = eqx.is_inexact_array(leaf) and leaf.ndim
             return jnp.broadcast_to(leaf[..., None], (*leaf.shape, cells)) if is_array else leaf
 

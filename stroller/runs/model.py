@@ -110,7 +110,7 @@ class RideModel(AbstractSceneModel):
         ride = cls(scene=scene, launch=launch, input=controls, jumps=inputs.as_jumps(jumps))
         return with_event(ride, event)
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         # A traced function cannot be pickled, so each process traces it.
         controls = inputs.users_input(self.input)
         event = None if self.event is None else self.event.function
@@ -341,7 +341,7 @@ def simulate(
     solver: diffrax.AbstractSolver | None = None,
     max_steps: int = 65536,
     adjoint: diffrax.AbstractAdjoint | None = None,
-    jumps: Sequence[Any] | Array | None = None,
+    jumps: Sequence[ArrayLike] | Array | None = None,
 ) -> Trajectory:
     """Simulate a ride from a launch until `t1`.
 
@@ -393,7 +393,7 @@ def sweep(
     launch: Launch,
     t1: float,
     *,
-    axes: dict[str, Any],
+    axes: dict[str, ArrayLike | Sequence[float]],
     input: Input | None = None,
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
@@ -402,7 +402,7 @@ def sweep(
     executor: Executor | None = None,
     device: str | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
-    jumps: Sequence[Any] | Array | None = None,
+    jumps: Sequence[ArrayLike] | Array | None = None,
 ) -> Table:
     """The ends of all rides over a grid of parameters, in one batched call on all cores.
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic import views
 from nonholonomic.hybrid import HybridOutcome
@@ -74,7 +74,7 @@ def ground_of(rides: list[Trajectory], normal: np.ndarray, *more: np.ndarray) ->
     """The part of the ground on which rides take place, with more points [m]."""
     scene, points = rides[0].model.scene, np.concatenate([*(np.asarray(ride.position) for ride in rides), *more])
     length = float(scene.body.wheelbase)
-    return views.arena(scene.surface, points, normal, 3.0 * length, length)
+    return views.stage.arena(scene.surface, points, normal, 3.0 * length, length)
 
 
 def normals(scene: Scene, position: Kind) -> Kind:
@@ -100,12 +100,12 @@ def frame_of(scene: Scene, normal: Kind, values: dict[str, Kind], angles: Sequen
     forward, left = cosine * x + sine * y, cosine * y - sine * x
     radius, half = RADIUS * length, 0.5 * TRACK * length
     axle, front = position + radius * z, position + length * x + radius * z
-    bodies = [(axle, views.quaternion(xp.stack([x, y, z], axis=-1)))]
+    bodies = [(axle, views.stage.quaternion(xp.stack([x, y, z], axis=-1)))]
     ends = ((axle + half * y, x, y), (axle - half * y, x, y), (front, forward, left))
     for (place, ahead, axis), angle in zip(ends, angles, strict=True):
         cosine, sine = xp.cos(angle)[..., None], xp.sin(angle)[..., None]
         rotation = xp.stack([cosine * ahead - sine * z, axis, sine * ahead + cosine * z], axis=-1)
-        bodies.append((place, views.quaternion(rotation)))
+        bodies.append((place, views.stage.quaternion(rotation)))
     # Above the ground, where lines are visible.
     contacts = [position + 0.02 * radius * z, position + length * x + 0.02 * radius * z]
     forces = [(contact, values["load"][..., k, None] * z) for k, contact in enumerate(contacts)]
@@ -133,7 +133,7 @@ def show(run: Trajectory, number: int, name: str) -> views.Show:
     angles = [reader(cumulative_trapezoid(speed / radius, np.asarray(run.t), initial=0.0)) for speed in speeds]
     values, normal = {name: reader(run[name]) for name in SHOWN}, reader(normals(scene, np.asarray(run.position)))
     frame = frame_of(scene, normal, values, angles)
-    wheel_mesh = views.wheel(radius, WIDTH * length, (views.DARK, views.PALE))
+    wheel_mesh = views.stage.wheel(radius, WIDTH * length, (views.DARK, views.PALE))
     meshes = (vehicle(length, colour), wheel_mesh, wheel_mesh, wheel_mesh)
     scale, width = WEIGHT * length / float(scene.body.mass * scene.gravity), 0.035 * length
     grip = np.asarray(run["grip"])[:, : len(run.loaded_axles)]
@@ -185,18 +185,20 @@ def vehicle(length: float, colour: int) -> tuple[views.Mesh, ...]:
     half, thickness = TRACK * length / 2.0, 0.025 * length
     low, high = 0.12 * length, 0.62 * length
     handle = [(-0.55 * length, sign * 0.3 * half, 0.95 * length) for sign in (1.0, -1.0)]
-    posts = [views.bar((0.0, end[1], low), end, thickness, views.DARK) for end in handle]
+    posts = [views.stage.bar((0.0, end[1], low), end, thickness, views.DARK) for end in handle]
     return (
-        views.bar((0.0, -half, 0.0), (0.0, half, 0.0), thickness, views.DARK),
-        views.bar((0.0, 0.0, 0.0), (0.92 * length, 0.0, 0.30 * length), thickness, views.DARK),
-        views.bar((length, 0.0, 0.22 * length), (length, 0.0, 0.34 * length), 1.4 * thickness, views.DARK),
-        views.bar((0.92 * length, 0.0, 0.30 * length), (length, 0.0, 0.30 * length), thickness, views.DARK),
-        views.box(
+        views.stage.bar((0.0, -half, 0.0), (0.0, half, 0.0), thickness, views.DARK),
+        views.stage.bar((0.0, 0.0, 0.0), (0.92 * length, 0.0, 0.30 * length), thickness, views.DARK),
+        views.stage.bar((length, 0.0, 0.22 * length), (length, 0.0, 0.34 * length), 1.4 * thickness, views.DARK),
+        views.stage.bar((0.92 * length, 0.0, 0.30 * length), (length, 0.0, 0.30 * length), thickness, views.DARK),
+        views.stage.box(
             (0.62 * length, 1.1 * half, high - low), (0.22 * length, 0.0, (low + high) / 2.0 + 0.06 * length), colour
         ),
-        views.box((0.5 * length, 0.9 * half, 0.02 * length), (0.22 * length, 0.0, high + 0.07 * length), views.PALE),
+        views.stage.box(
+            (0.5 * length, 0.9 * half, 0.02 * length), (0.22 * length, 0.0, high + 0.07 * length), views.PALE
+        ),
         *posts,
-        views.bar(handle[0], handle[1], 1.3 * thickness, views.DARK),
+        views.stage.bar(handle[0], handle[1], 1.3 * thickness, views.DARK),
     )
 
 
@@ -213,7 +215,7 @@ def explore(
     t1: float = 8.0,
     input: Input | None = None,
     unit: Unit = None,
-    jumps: Sequence[Any] | Array | None = None,
+    jumps: Sequence[ArrayLike] | Array | None = None,
     label: str | None = None,
 ) -> views.Page:
     """Make a page with sliders that simulates the ride in the browser while you move a slider.

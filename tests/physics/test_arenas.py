@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.geometry import frame_of
+from nonholonomic.geometry.frames import frame_of
 from nonholonomic.validation import as_number
 from tippe.friction import AbstractFriction, ContactLoad
 

@@ -33,7 +33,7 @@ INVERTED = 0.95 * jnp.pi
 STEM_COSINE, BEYOND = -3.0, 2.0
 
 
-def event_of(scene: Scene, angle: Any) -> Float[Array, "..."] | StemContact:
+def event_of(scene: Scene, angle: ArrayLike | None) -> Float[Array, "..."] | StemContact:
     """The event of a run: theta reaches the angle [rad]; or, without an angle, the top has turned over.
 
     A top with a stem has turned over when its stem first carries it: when the stem bears a force or, as it lands, an
@@ -45,7 +45,7 @@ def event_of(scene: Scene, angle: Any) -> Float[Array, "..."] | StemContact:
     return as_number(INVERTED if angle is None else angle)
 
 
-def angle_of(scene: Scene, angle: Any) -> Float[Array, "..."]:
+def angle_of(scene: Scene, angle: ArrayLike | None) -> Float[Array, "..."]:
     """The angle [rad] itself; or, without an angle, the inclination beyond which the top has turned over on a level
     plane."""
     event = event_of(scene, angle)

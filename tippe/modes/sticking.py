@@ -149,7 +149,7 @@ class Land(airborne.Fly):
 
 
 def stick_slip_modes(
-    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
+    scene: Scene, problem: InversionProblem, tolerance: ArrayLike, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** `tolerance`: as for `ContactMode`;
     the others as for `hopping_modes`."""

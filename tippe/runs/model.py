@@ -33,7 +33,7 @@ from ..model.rigid import AbstractRigidBody
 from ..model.scene import SPINS, Launch, Scene
 from ..modes.airborne import airborne_modes
 from ..modes.plane import hopping_modes
-from ..modes.problems import BEHIND_PATH, INVERTED, InversionProblem, StemContact, event_of, trajectory_problem
+from ..modes.problems import BEHIND_PATH, INVERTED, Event, InversionProblem, StemContact, event_of, trajectory_problem
 from ..modes.sticking import ROLLING, above_the_ground, energy_in, loss, stick_slip_modes
 from .observables import COMPONENTS, DIRECTION, ON_CURVED, PASSIVE, PATH, AbstractTrajectory, allowance, quantities_of
 from .trajectory import HybridTrajectory, Trajectory, simulate_launch
@@ -50,7 +50,7 @@ def of_launches(function: Function) -> Function:
 
 
 def modes_of(
-    scene: Scene, problem: InversionProblem, tolerance: Any, last: bool, with_quadratures: bool = False
+    scene: Scene, problem: InversionProblem, tolerance: Number, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
     """The modes of runs in a scene whose runs are not smooth, and the index of each cell's first mode. **Arguments:** as for
     `stick_slip_modes`."""
@@ -134,7 +134,7 @@ class TopModel(AbstractSceneModel):
 
     scene: Scene
     launch: Launch
-    angle: Any = None
+    angle: Event = None
     event: EventFunction | None = None
     reverses: bool = eqx.field(static=True, default=False)
     #: The index of the first mode, if it is known: round-off would let a rolling start slip.
@@ -153,13 +153,13 @@ class TopModel(AbstractSceneModel):
         return with_event(cls(scene=_integrated(scene), launch=launch), event)
 
     @classmethod
-    def timed(cls, scene: Scene, launch: Launch, angle: Any) -> "TopModel":
+    def timed(cls, scene: Scene, launch: Launch, angle: Event) -> "TopModel":
         """The model of a launch until theta reaches an angle [rad], until the stem carries the top (`StemContact`), or,
         without an angle, until the spin reverses."""
         event = angle if angle is None or isinstance(angle, StemContact) else jnp.asarray(angle, float)
         return cls(scene=scene, launch=launch, angle=event, reverses=angle is None)
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         # A traced function cannot be pickled, so each process traces it.
         if self.event is None:
             return TopModel, (self.scene, self.launch, self.angle, None, self.reverses)
@@ -369,7 +369,7 @@ class TopModel(AbstractSceneModel):
         has_path = PATH in needs or (ON_CURVED in needs and not isinstance(scene.surface, Plane))
         return CoreProblem(run, len(run.start()[0]) - BEHIND_PATH if has_path else run.leading)
 
-    def modes(self, cells: int, tolerance: Any, names: Names, continues: bool) -> Start:
+    def modes(self, cells: int, tolerance: Number, names: Names, continues: bool) -> Start:
         if self.smooth:
             return super().modes(cells, tolerance, names, continues)
         core = self._without_path(cells, names)
@@ -387,7 +387,7 @@ class TopModel(AbstractSceneModel):
         run = dataclasses.replace(self.moment(rows, mode), start=self.scene.state(self.launch))
         return {name: getattr(run, name) for name in names}
 
-    def moment(self, rows: Float[Array, "rows *cells"], mode: Any) -> Any:
+    def moment(self, rows: Float[Array, "rows *cells"], mode: Any) -> AbstractTrajectory:
         """The states as a trajectory without times."""
         scene, kind, zeros = self.scene, self.trajectories, jnp.zeros(rows.shape[1:])
         core = len(scene.state(self.launch))

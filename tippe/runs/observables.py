@@ -22,7 +22,7 @@ from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import Unit, distinguishing_labels, in_unit, unit_of
 from nonholonomic.validation import ArrayOrList, is_traced, require_one_run, times_within
-from nonholonomic.views import Marks
+from nonholonomic.views.stage import Marks
 
 from ..friction import Frictionless
 from ..model.body import AbstractBody, Top
@@ -112,12 +112,12 @@ class AbstractTrajectory(AbstractRun):
     Vectors are arrays (times, 3) in the fixed frame (x, y, z); see `Trajectory`.
     """
 
-    t: Float[Any, " times"]
+    t: Float[Values, " times"]
     scene: Scene
     states: Float[Any, "components times"]
-    cyclic: Float[Any, "paths times"]
-    spin_angle: Float[Any, " times"]
-    work: Float[Any, " times"]
+    cyclic: Float[Values, "paths times"]
+    spin_angle: Float[Values, " times"]
+    work: Float[Values, " times"]
     # The end of the run; not needed where only the times are read, as in a page.
     status: Any = None
     end_time: Any = None

@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -16,15 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.derivatives import VariationalProblem, differentiable_solve, in_groups, tangents_by
 from nonholonomic.integration import Lanes, Settings, crossing_time, solve_ensemble
-from nonholonomic.integration.problem import (
-    CROSSED,
-    DEFAULT_MAX_STEPS,
-    FAILED,
-    MOST_STEPS,
-    Status,
-    require_run,
-    require_times,
-)
+from nonholonomic.integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, MOST_STEPS, Status, require_run
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.runs.attractors import LyapunovExponent, exponent_of_model
 from nonholonomic.runs.event import EventTime, time_of_event
@@ -54,6 +46,10 @@ from .model import INVERSIONS, REVERSALS, SEVERAL, TopModel, of_launches, why_un
 from .observables import QUANTITIES, quantities_of
 from .trajectory import HybridTrajectory, Trajectory, simulate_launch
 
+#: One value or several of a number of a launch, and the values of other parameters by their names.
+NumberOrList: TypeAlias = ArrayLike | Sequence[float] | None
+Axes: TypeAlias = dict[str, ArrayLike | Sequence[float]] | None
+
 # Checks of the arguments of a run, before anything compiles and inside a program.
 
 #: The most turns a second by hand: greater spins are not taken for turns a second.
@@ -78,7 +74,7 @@ def check_run(scene: Any, launch: Any, t1: Number, tolerance: Number, lists: str
         warn(f"t1 = {np.max(t1):g} s is long for a top; times are in seconds: did you mean t1={np.max(t1) / 1e3:g}?")
 
 
-def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: object, angle: object) -> None:
+def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any, spin: object, angle: ArrayLike | None) -> None:
     """Warn if the scene has no friction, if the top stands exactly upright on a level plane or is inverted already, or if
     it is too slow to turn over, and would not be if its spin were in turns a second.
 
@@ -148,7 +144,7 @@ def check_smooth(scene: Scene, caller: str) -> None:
         )
 
 
-def check_reversible(scene: Scene, launch: Launch, values: Mapping[str, Any] | None = None) -> None:
+def check_reversible(scene: Scene, launch: Launch, values: Mapping[str, object] | None = None) -> None:
     """Raise `ValueError` for a body that cannot reverse its spin, and for a launch without spin.
 
     **Arguments:** `values`: full name of a number -> values in place of the launch's own.
@@ -164,7 +160,7 @@ def check_reversible(scene: Scene, launch: Launch, values: Mapping[str, Any] | N
         raise ValueError("spin = 0.0 must not be zero: a spin of zero cannot reverse")
 
 
-def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
+def check_event(angle: ArrayLike | None, crossing: object, known: tuple[str, ...] = ("first", "last")) -> None:
     """Raise `ValueError` unless the angle is `None` or in (0, pi], and the crossing is a known word."""
     if angle is not None:
         require(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
@@ -251,17 +247,17 @@ def inversion_table(
     scene: Scene,
     launch: Launch | None = None,
     *,
-    theta: Any = None,
-    spin: Any = None,
-    eta: Any = 0.0,
-    mu: Any = None,
+    theta: NumberOrList = None,
+    spin: NumberOrList = None,
+    eta: NumberOrList = 0.0,
+    mu: NumberOrList = None,
     t1: float,
     angle: float | None = None,
     tolerance: float = 1e-9,
     crossing: str = "first",
     path: str | Path | None = None,
-    azimuth: Any = 0.0,
-    axes: dict[str, Any] | None = None,
+    azimuth: NumberOrList = 0.0,
+    axes: Axes = None,
     solver: diffrax.AbstractERK | None = None,
     method: str = "ensemble",
     scattered: bool = False,
@@ -375,14 +371,14 @@ def reversal_table(
     scene: Scene,
     launch: Launch | None = None,
     *,
-    theta: Any = None,
-    spin: Any = None,
-    azimuth: Any = 0.0,
-    mu: Any = None,
+    theta: NumberOrList = None,
+    spin: NumberOrList = None,
+    azimuth: NumberOrList = 0.0,
+    mu: NumberOrList = None,
     t1: float,
     tolerance: float = 1e-9,
     path: str | Path | None = None,
-    axes: dict[str, Any] | None = None,
+    axes: Axes = None,
     solver: diffrax.AbstractERK | None = None,
     scattered: bool = False,
     errors: bool = False,
@@ -424,8 +420,8 @@ def reversal_table(
 
 def event_table(
     scene: Scene,
-    launch_values: dict[str, Any],
-    axes: dict[str, Any] | None,
+    launch_values: dict[str, object],
+    axes: Axes,
     t1: float,
     angle: Any,
     options: Options,
@@ -482,12 +478,12 @@ def trajectory_table(
     scene: Scene,
     launch: Launch | None = None,
     *,
-    theta: Any = None,
-    spin: Any = None,
-    eta: Any = 0.0,
-    mu: Any = None,
-    times: Any,
-    axes: dict[str, Any] | None = None,
+    theta: NumberOrList = None,
+    spin: NumberOrList = None,
+    eta: NumberOrList = 0.0,
+    mu: NumberOrList = None,
+    times: ArrayLike | Sequence[float],
+    axes: Axes = None,
     quantities: Sequence[str] = ("theta", "eta"),
     tolerance: float = 1e-9,
     path: str | Path | None = None,
@@ -547,7 +543,6 @@ def trajectory_table(
     """
     require_outside((scene, launch, theta, spin, eta, mu, times, axes), "trajectory_table", "simulate with times=")
     require_kind(scene, "scene", Scene)
-    require_times(as_number(times), None)
     samples = samples_of(quantities_of(scene), times, quantities, None)
     assert samples is not None
     options = Options(tolerance, solver, max_steps, path=path, progress=progress, executor=executor, device=device)
@@ -570,7 +565,7 @@ def simulate(
     scene: Scene,
     launch: Launch,
     t1: float | Float[Array, ""],
-    times: Any = None,
+    times: ArrayLike | Sequence[float] | None = None,
     tolerance: float | Float[Array, ""] = 1e-9,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -882,12 +877,9 @@ class ExtendedTime(EventTime):
         return times, slopes
 
 
-def beyond_horizon(end: Lanes, start: Lanes, angle: Any, t1: Any) -> Lanes:
+def beyond_horizon(end: Lanes, start: Lanes, angle: Float[Array, "..."], t1: Float[Array, "..."]) -> Lanes:
     """The time [s] of a top that has not inverted by `t1`, with theta at the end and at the start of the run [rad]; see
     `extended_inversion_time`."""
-
-    def e_folds(theta: Lanes) -> Lanes:
-        """Number of e-folds by which theta must still grow to reach the angle."""
-        return jnp.log(angle / least(greatest(theta, LEAST_ANGLE), angle))
-
-    return t1 * (1.0 + e_folds(end) / greatest(e_folds(start), 1.0))
+    # The numbers of e-folds by which theta must still grow to reach the angle.
+    missing, at_start = (jnp.log(angle / least(greatest(theta, LEAST_ANGLE), angle)) for theta in (end, start))
+    return t1 * (1.0 + missing / greatest(at_start, 1.0))

@@ -81,7 +81,7 @@ def frames(run: AbstractTrajectory) -> Frame[Array]:
     rotation = (run.angular_velocity * normal).sum(axis=-1) if isinstance(body, AbstractRigidBody) else run.jellett
     return Frame(
         normal=normal,
-        bodies=((position, views.quaternion(run.rotation)),),
+        bodies=((position, views.stage.quaternion(run.rotation)),),
         traces=((above, None), (AXIS * radius * axis, position)),
         arrows=(
             (above, run.normal_force[:, None] * normal),
@@ -156,14 +156,14 @@ def _(
 def arena_of(scene: Scene, runs: Sequence[Frame[np.ndarray]], normal: np.ndarray, margin: float = 0.0) -> views.Arena:
     """The part of the arena on which runs take place. **Arguments:** `margin`: its least width [m] beyond their contacts."""
     points, size = np.concatenate([frames.traces[0][0] for frames in runs]), float(scene.body.size)
-    return views.arena(scene.surface, points, normal, max(margin, 4.0 * size), 2.5 * size)
+    return views.stage.arena(scene.surface, points, normal, max(margin, 4.0 * size), 2.5 * size)
 
 
 def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[views.Mesh, ...]:
     """The body in two colours; a top has its stem, or a short stem that only shows the axis."""
     if isinstance(body, AbstractRigidBody):
         rigid_meshes = []
-        for mesh in views.ball(1.0, (colour, views.PALE)):
+        for mesh in views.stage.ball(1.0, (colour, views.PALE)):
             # The points of the surface at which the body has the outward unit normals of a ball.
             normal, zero = tuple(-jnp.asarray(mesh.vertices).T), jnp.zeros(len(mesh.vertices))
             vertices = np.stack(body.contact(normal, (zero, zero, zero))[0], axis=-1)
@@ -174,15 +174,15 @@ def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[views.M
         theta = jnp.linspace(jnp.pi, 0.0, 49)
         lever = body.meridian.at(jnp.cos(theta))
         meridian = (lever.radius * jnp.sin(theta), lever.offset - lever.radius * jnp.cos(theta))
-        return views.striped(np.stack(meridian, axis=-1), (colour, views.PALE))
+        return views.stage.striped(np.stack(meridian, axis=-1), (colour, views.PALE))
     radius = float(body.radius)
     if body.stem is None:
-        axis = views.rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, views.DARK)
-        return (*views.ball(radius, (colour, views.PALE)), axis)
+        axis = views.stage.rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, views.DARK)
+        return (*views.stage.ball(radius, (colour, views.PALE)), axis)
     knob, end = float(body.stem.radius), float(body.stem.offset - body.offset)
     return (
-        *views.striped(truncated(radius, knob, end), (colour, views.PALE)),
-        views.rod(0.999 * knob, 0.0, end, knob, views.DARK),
+        *views.stage.striped(truncated(radius, knob, end), (colour, views.PALE)),
+        views.stage.rod(0.999 * knob, 0.0, end, knob, views.DARK),
     )
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from close import assert_close
 
-from nonholonomic.geometry import planar_length
+from nonholonomic.geometry.vector import planar_length
 
 
 def along(t, scale=1.0):

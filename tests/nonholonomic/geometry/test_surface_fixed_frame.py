@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholonomic.geometry import Cylinder, Graph, Implicit, Paraboloid, Plane, Sphere, Spheroid, Torus, tangents
+from nonholonomic.geometry import Cylinder, Graph, Implicit, Paraboloid, Plane, Sphere, Spheroid, Torus
+from nonholonomic.geometry.vector import tangents
 
 RNG = np.random.default_rng(5)
 LANES = 40
