@@ -1,6 +1,6 @@
 """The vector fields in scalar arithmetic, for other programs.
 
-They are the formulas of `tippe/model/dynamics.py` and `stroller/model/dynamics.py`. The same text serves NumPy, numba,
+They are the formulas of `tippe/model/dynamics.py` and `stroller/model/scene.py`. The same text serves NumPy, numba,
 JAX and heyoka: the components are numbers, arrays or symbolic expressions, and the caller passes the functions.
 `scenes.misprint` compares each field with the scene's own.
 """

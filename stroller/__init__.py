@@ -21,11 +21,11 @@ from .friction import AbstractFriction as AbstractFriction
 from .friction import Damping as Damping
 from .friction import Frictionless as Frictionless
 from .friction import RollingResistance as RollingResistance
-from .model.dynamics import Stroller as Stroller
 from .model.input import Motion as Motion
 from .model.input import Steady as Steady
 from .model.scene import Launch as Launch
 from .model.scene import Scene as Scene
+from .model.scene import Stroller as Stroller
 from .planning.plan import Plan as Plan
 from .planning.plan import plan as plan
 from .planning.plan import track as track

@@ -24,9 +24,8 @@ from nonholonomic.terminal import Progress, status_line
 from nonholonomic.validation import Bound, Bounded, as_number, replacing, require_folder
 
 from .friction import Damping
-from .model.dynamics import Stroller
 from .model.input import Motion
-from .model.scene import FORKS, Launch, Scene
+from .model.scene import FORKS, Launch, Scene, Stroller
 from .planning.plan import Plan, plan, planned_stage
 from .planning.problem import Box, Goal, Limits
 from .runs.model import simulate

@@ -19,8 +19,7 @@ The papers on the stroller state no numbers. We chose ordinary values; no stroll
 from nonholonomic.geometry import Plane, Spheroid
 
 from .friction import Damping
-from .model.dynamics import Stroller
-from .model.scene import Scene
+from .model.scene import Scene, Stroller
 
 
 def light() -> Stroller:

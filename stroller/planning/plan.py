@@ -20,8 +20,7 @@ from nonholonomic.views.pages import page, require_page
 from nonholonomic.views.plot import draw_title, new_figure
 from nonholonomic.views.stage import bar, curves_in, fixed, of_grid, own
 
-from ..model.dynamics import Dynamics, Number, padded
-from ..model.scene import Launch, Scene
+from ..model.scene import Dynamics, Launch, Number, Scene, padded
 from ..runs.model import simulate
 from ..runs.trajectory import Trajectory
 from ..runs.view import ground_of, normals

@@ -18,8 +18,7 @@ from nonholonomic.terminal import Progress, status_line
 from nonholonomic.text import likely, shown
 from nonholonomic.validation import explaining, require, require_flag, require_kind, require_package, require_whole
 
-from ..model.dynamics import Dynamics, Number, padded
-from ..model.scene import Scene
+from ..model.scene import Dynamics, Number, Scene, padded
 from .problem import FAR, FROM_ABOVE, SQUARE, Pose, checked_problem, frame_of
 from .transcription import ORDER, Task, drive_from, motion_at, point_residuals, windows
 

@@ -16,8 +16,7 @@ from nonholonomic.integration.problem import require_run
 from nonholonomic.text import shown
 from nonholonomic.validation import Bound, Bounded, Usual, as_number, require, require_kind
 
-from ..model.dynamics import Dynamics, padded
-from ..model.scene import HEADING, STEERING, Launch, Scene, as_numbers, as_place
+from ..model.scene import HEADING, STEERING, Dynamics, Launch, Scene, as_numbers, as_place, padded
 
 #: Numbers, points (..., points, 2), and points or a point of the ground, seen from above or in space, in NumPy or in JAX.
 Numbers: TypeAlias = Float[Array | np.ndarray, "..."]

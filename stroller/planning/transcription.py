@@ -20,8 +20,8 @@ from scipy.interpolate import make_interp_spline
 
 from nonholonomic.geometry import AbstractSurface, Vector, add, cross, difference, dot, multiply, scale, subtract
 
-from ..model.dynamics import Dynamics, Number, padded
 from ..model.input import Motion
+from ..model.scene import Dynamics, Number, padded
 from .problem import LIMIT_RESERVE, Footprint, Obstacles, Pose, Problem, corners_of, frame_of
 
 #: Coefficients of the splines of the steering angle and of the front wheel's speed, all or those of an interval; and the
@@ -32,7 +32,7 @@ Unknowns: TypeAlias = Float[Array, "rows unknowns"]
 # Inverse dynamics: the force and the torque that move the stroller with a given speed and steering angle.
 #
 # Position and heading follow from the speed of the front wheel and the steering angle alone, on every ground; force and
-# torque enter the rates of the momentum P and of the fork linearly (`model/dynamics.py`), which determines them.
+# torque enter the rates of the momentum P and of the fork linearly (`model/scene.py`), which determines them.
 
 
 class Rates(NamedTuple):

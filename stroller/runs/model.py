@@ -32,9 +32,8 @@ from nonholonomic.text import is_array, is_users, name_of, parted, shown
 from nonholonomic.validation import all_bounds, explaining, legal, require_kind, require_outside, require_scalars
 
 from ..model import input as inputs
-from ..model.dynamics import Stroller
 from ..model.input import Formula, Input, PerRide, Steady
-from ..model.scene import USUAL, Launch, RideProblem, Scene
+from ..model.scene import USUAL, Launch, RideProblem, Scene, Stroller
 from .trajectory import QUANTITIES, TIMED, VECTORS, RideState, Trajectory, ride
 
 #: Names of the coordinates of a place in the fixed frame.

@@ -24,9 +24,8 @@ from nonholonomic.runs.trajectory import AbstractRun
 from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import Unit, as_text, distinguishing_labels
 
-from ..model.dynamics import Number, Power, State, padded
 from ..model.input import Input
-from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, Scene
+from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, Number, Power, Scene, State, padded
 
 #: Times [s].
 Times = Float[Array, " times"]

@@ -21,9 +21,8 @@ from nonholonomic.validation import explaining
 from nonholonomic.views.explore import Frame, LiveRun
 from nonholonomic.views.stage import Kind, fixed
 
-from ..model.dynamics import State
 from ..model.input import Input
-from ..model.scene import DRIVES, Launch, RideProblem, Scene
+from ..model.scene import DRIVES, Launch, RideProblem, Scene, State
 from .model import FORM, RideModel, checked_model
 from .trajectory import MOST_GRIP, QUANTITIES, RideState, Trajectory
 

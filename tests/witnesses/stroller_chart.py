@@ -13,9 +13,8 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import AbstractQuadric, Plane, add, inverse, multiply, subtract
 from nonholonomic.systems.mechanics import AbstractSystem, Coordinates
 from stroller.friction import WheelMotion
-from stroller.model.dynamics import State
 from stroller.model.input import Input, Motion
-from stroller.model.scene import FORKS, Scene
+from stroller.model.scene import FORKS, Scene, State
 
 
 class Chart(AbstractSystem):
