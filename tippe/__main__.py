@@ -21,7 +21,6 @@ from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.sweeps import AnotherRun, Table, saved_cells
 from nonholonomic.terminal import Progress
 from nonholonomic.validation import replacing, require_folder
-from nonholonomic.views.explore import live_page
 
 from . import paper, steady
 from .friction import Coulomb
@@ -158,7 +157,7 @@ def sliders(options: argparse.Namespace) -> str:
     """The page of the top with sliders, with a placeholder for the contents below."""
     model = TopModel(scene=scene(options, "plane"), launch=launch_shown(options))
     live = page_of_launch(model, None, options.t1)._replace(title=TITLE)
-    return live_page(live, stage_at_start(model, options.t1), 0.2, BELOW, ("deg", "rpm")).html
+    return views.pages.live_page(live, stage_at_start(model, options.t1), 0.2, BELOW, ("deg", "rpm")).html
 
 
 def computed(options: argparse.Namespace, cache: Path | None) -> tuple[dict[str, Table], list[Path], str]:

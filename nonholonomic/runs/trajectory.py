@@ -25,8 +25,7 @@ from ..terminal import status_line
 from ..text import Unit, as_text, distinguishing_labels, readable_unit, require_unit, shown, unit_of
 from ..validation import IN_DEGREES, explaining, is_traced, require_all, require_one_run, times_within
 from ..views import COLOURS, PALE, Arena, Ball, Box, Line, Page, Show, Stage, stage_of
-from ..views.explore import Frame, LiveRun, Simulator, Slider, live_page
-from ..views.pages import require_labels, require_page
+from ..views.pages import Frame, LiveRun, Simulator, Slider, live_page, require_labels, require_page
 from ..views.stage import Draw, Drawing, Parts, Wheel, meshes_of, of_grid
 from .model import AbstractModel, Names, Sliders, model_of, run_of
 

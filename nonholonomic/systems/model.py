@@ -26,7 +26,7 @@ from ..runs.trajectory import Trajectory, drawn_stage, frame_of, live_run, page_
 from ..sweeps import Axis, Quantity, Variable
 from ..text import counted, name_of, shown
 from ..validation import as_number, is_traced
-from ..views.explore import Frame, LiveRun
+from ..views.pages import Frame, LiveRun
 from ..views.stage import Draw, Stage
 from . import mechanics
 from .engine import ROUND_OFF, BatchedMode, time_and_state

@@ -25,7 +25,7 @@ from nonholonomic.sweeps import Quantity, Table, chosen, run_table
 from nonholonomic.text import Unit, as_text, distinguishing_labels
 
 from ..model.input import Input
-from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, Number, Power, Scene, State, padded
+from ..model.scene import CONTACT_ROUND_OFF, RANK_LOST, Number, Power, Scene, State
 
 #: Times [s].
 Times = Float[Array, " times"]
@@ -127,12 +127,8 @@ def side_slip(ride: RideState) -> tuple[Component, Component]:
     """
     scene, state, g = ride.scene, ride.states, ride.geometry
     dynamics, rate = scene.dynamics, scene.dynamics.field(ride.t, state, ride.controls)
-
-    def heading_components(state):
-        return [component for component in dynamics.geometry(state).motion.heading if component is not None]
-
     velocity = dynamics.unpack(rate)[0]
-    heading_rate = padded(jax.jvp(heading_components, (state,), (rate,))[1])
+    heading_rate = jax.jvp(lambda state: dynamics.geometry(state).motion.heading, (state,), (rate,))[1]
     if scene.heading == "projected":
         heading, left = g.motion.heading, (-g.motion.heading[1], g.motion.heading[0], None)
     else:

@@ -18,7 +18,7 @@ from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, pag
 from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit
 from nonholonomic.validation import explaining
-from nonholonomic.views.explore import Frame, LiveRun
+from nonholonomic.views.pages import Frame, LiveRun
 from nonholonomic.views.stage import Kind, fixed
 
 from ..model.input import Input

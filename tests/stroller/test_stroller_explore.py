@@ -9,7 +9,7 @@ from browser import complaints, needs_browser, open_browser, wait
 
 import stroller
 from nonholonomic.runs.trajectory import TOLERANCE
-from nonholonomic.views.explore import programs
+from nonholonomic.views.pages import programs
 from stroller.runs.model import RideModel
 from stroller.runs.view import default_ranges, page_of_ride
 

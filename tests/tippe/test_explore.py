@@ -13,7 +13,7 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.runs.trajectory import TOLERANCE
-from nonholonomic.views.explore import programs
+from nonholonomic.views.pages import programs
 from tippe.runs.model import TopModel
 from tippe.runs.observables import AFTERWARDS
 from tippe.runs.view import page_of_launch

@@ -24,7 +24,7 @@ from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, pag
 from nonholonomic.sweeps import chunk_for
 from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit, readable_unit, with_unit
-from nonholonomic.views.explore import Frame, LiveRun
+from nonholonomic.views.pages import Frame, LiveRun
 from nonholonomic.views.plot import new_figure
 
 from ..friction import NoSlip

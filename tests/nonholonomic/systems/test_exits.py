@@ -10,7 +10,7 @@ from close import assert_close
 from nonholonomic import AbstractMode, AbstractSystem, Hybrid, event_time, simulate, sweep
 from nonholonomic.runs.model import model_of
 from nonholonomic.runs.trajectory import page_of
-from nonholonomic.views.explore import programs
+from nonholonomic.views.pages import programs
 
 
 class Room(AbstractMode):

@@ -13,7 +13,7 @@ import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, event_time, simulate, sweep
 from nonholonomic.runs.model import model_of
 from nonholonomic.runs.trajectory import page_of
-from nonholonomic.views.explore import programs
+from nonholonomic.views.pages import programs
 
 
 class Pulse(AbstractMode):

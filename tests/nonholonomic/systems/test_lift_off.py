@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from nonholonomic import AbstractMode, Hybrid, event_time, simulate, sweep
 from nonholonomic.runs.model import model_of
 from nonholonomic.runs.trajectory import page_of
-from nonholonomic.views.explore import programs
+from nonholonomic.views.pages import programs
 
 G = 9.8
 
