@@ -18,12 +18,12 @@ from nonholonomic.geometry import (
     add,
     cross,
     dot,
-    frame_of,
     multiply,
     rate_in_frame,
     scale,
     subtract,
 )
+from nonholonomic.geometry.frames import frame_of
 
 DISTANCE, PULL = jnp.asarray(0.02), jnp.asarray(20.0)
 SURFACES = {

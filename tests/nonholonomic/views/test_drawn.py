@@ -23,13 +23,11 @@ from nonholonomic.views import (
     Show,
     Stage,
     Trace,
-    arena,
-    ball,
     page,
-    quaternion,
 )
 from nonholonomic.views.pages import Viewable
 from nonholonomic.views.plot import draw_series
+from nonholonomic.views.stage import arena, ball, quaternion
 
 SURFACES = (
     (Plane(), (0.3, 0.1)),
