@@ -15,7 +15,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from ..compilation.tracing import Bounds, UnboundedError, enclosing
-from .problem import AbstractProblem
+from .problem import AbstractProblem, on_side
 from .runge_kutta import Integers, Lanes, Mask, States, Step, inverse_root
 
 #: An event is located once the next trial would differ by less than this fraction of the step that contains it. The
@@ -317,7 +317,7 @@ def watched(problem: AbstractProblem, side: Lanes, path: Path, free: Mask, may_c
     def functions(time: Lanes, state: States) -> Functions:
         margins = problem.margins(time, state) if problem.fast[0] else ()
         event = problem.event_function(state) if problem.fast[1] else None
-        values = [*margins, *([] if event is None else [side * event])]
+        values = [*margins, *([] if event is None else [on_side(side, event)])]
         return jnp.stack(values) if values else jnp.zeros((0, *time.shape))
 
     if not len(jax.eval_shape(functions, path.time, path.start)):

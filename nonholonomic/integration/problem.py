@@ -227,11 +227,17 @@ class AbstractProblem(eqx.Module):
     def crossing_on(self, side: Lanes, state: States, rate: States) -> Lanes | None:
         """`crossing_along` with the sign that makes it positive on the lane's side of the event, 1 or -1."""
         value = self.crossing_along(state, rate)
-        return None if value is None else side * value
+        return None if value is None else on_side(side, value)
 
     def least_margin(self, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
         """The lesser of the domain margin and the event function on the lane's side of the event."""
         return lesser(self.domain_margin(time, state), self.crossing_on(side, state, rate), side)
+
+
+def on_side(side: Lanes, value: Lanes) -> Lanes:
+    """An event function with the sign that makes it positive on a side of the event, 1 or -1. Zero itself is beyond the event:
+    a function that stays zero does not fall through it again and again."""
+    return side * value - 1e-300 * jnp.minimum(side, 0.0)
 
 
 class AbstractDerivedProblem(AbstractProblem):

@@ -46,7 +46,8 @@ DEVICE double least_margin(const double* constants, const double* time, const do
   if constexpr (M::has_event) {
     double value;
     M::crossing(constants, state, rate, &value);
-    result = least(result, side * value);
+    // Zero is beyond the event.
+    result = least(result, side * value + (side < 0.0 ? 1e-300 : 0.0));
   }
   return result;
 }

@@ -427,8 +427,8 @@ def event_time(
     """Time of the event of a run; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
     The event is the first time after the start at which a function falls through zero, along the motion or by a reset.
-    For a run that starts at or below zero, the event is the next time at which the function falls through zero. Under
-    `vmap`, all runs are lanes of one batch.
+    For a run that starts at or below zero, the event is the next time at which the function falls through zero: a function
+    that stays zero has no event. Under `vmap`, all runs are lanes of one batch.
 
     Derivatives with respect to the start and every parameter of the system and of the event are exact: they use the
     implicit function theorem at the event and the saltation matrix at every reset (`nonholonomic/hybrid/saltation.py`).

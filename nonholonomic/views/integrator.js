@@ -32,7 +32,8 @@ function integrator(model) {
     // Write the margins into a row, and return the least of them and of the event function.
     function least(row, time, state, rate, side) {
       model.margins(constants, time, state, margins[row]);
-      return Math.min(...margins[row], side * value(model.crossing, constants, state, rate));
+      // Zero is beyond the event.
+      return Math.min(...margins[row], side * value(model.crossing, constants, state, rate) + (side < 0 ? 1e-300 : 0));
     }
 
     // Write one step from a state with a known rate into `tried`; without `watches`, compute only the end of the step.

@@ -58,6 +58,8 @@ class Linear(eqx.Module):
         ((0.0, 0.0, 1.0, 0.0), [1.0, 0.0, 0.0], 1.8 * bounce(1.0, 0.8, GRAVITY, 1)),
         # Starts beyond the event, and crosses it downwards on the second fall.
         ((-0.5, 1.0, 0.0, 0.0), [0.4, 0.0, 0.0], jnp.inf),
+        # Is zero at the start and stays zero, without a fall.
+        ((0.0, 0.0, 0.0, 0.0), [1.0, 0.0, 0.0], jnp.inf),
         # A function of time alone.
         ((0.7, 0.0, 0.0, -1.0), [1.0, 0.0, 0.0], 0.7),
     ],
@@ -111,6 +113,11 @@ def half_life(rate, level):
 def with_change(time):
     """A time with its derivatives by rate and level, and how they change with the rate."""
     return lambda *numbers: jax.jvp(jax.value_and_grad(time, (0, 1)), numbers, (1.0, 0.0))
+
+
+def test_a_state_that_rests_on_its_event_has_none():
+    assert np.isinf(half_life(jnp.asarray(0.0), 1.0))
+    assert_close(half_life(jnp.asarray(2.0), 0.5), 0.5 * jnp.log(2.0), rtol=1e-12)
 
 
 derivatives_of_half_life = jax.jit(with_change(half_life))
