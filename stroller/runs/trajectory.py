@@ -453,7 +453,7 @@ class Trajectory(AbstractRun):
             f"  steps           {int(self.stats.steps)} accepted, {int(self.stats.rejected)} rejected",
             f"  end             place {as_text(tuple(self.place[-1]))}, heading {float(self.heading[-1]):.6g} rad, "
             f"speed {float(self.speed[-1]):.6g} m/s, steering {float(self.steering[-1]):.6g} rad",
-            f"  energy          {float(self.energy[0]):.6g} J to {float(self.energy[-1]):.6g} J, "
+            f"  energy          {float(self.energy[0]):.6g} J at the start, {float(self.energy[-1]):.6g} J at the end, "
             f"work {float(self.work[-1]):.6g} J, residual {float(jnp.max(jnp.abs(self.energy_residual))):.1e} J",
             f"  normal force    {float(jnp.min(self.normal_force)):.6g} N to {float(jnp.max(self.normal_force)):.6g} N",
             f"  side forces     up to {as_text(tuple(jnp.max(jnp.abs(self.side_force), axis=0)))} N, rear and front",

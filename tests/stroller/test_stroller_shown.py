@@ -51,6 +51,7 @@ def test_a_ride_goes_to_xarray_a_file_and_a_picture(tmp_path):
     assert list(data["coordinate"].values) == ["x", "y"]
     assert list(run.to_dataframe()["side_force.rear"]) == list(run.side_force[:, 0])
     assert f"{int(run.stats.steps)} accepted, {int(run.stats.rejected)} rejected" in str(run)
+    assert f"{run.energy[0]:.6g} J at the start, {run.energy[-1]:.6g} J at the end" in str(run)
     # Completion in a notebook knows the quantities.
     assert {"speed", "power", "at"} <= set(dir(run))
     assert run.plot("heading", unit="deg").axes[0].get_ylabel() == "heading ψ [deg]"

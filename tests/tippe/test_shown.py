@@ -224,7 +224,9 @@ def test_a_launch_in_degrees_is_shown_in_degrees(run):
     assert_close(launch.theta, np.radians(6.0), rtol=1e-15)
     in_degrees = tippe.simulate(run.scene, launch, 1.0, tolerance=1e-6)
     assert in_degrees.launch is launch
-    assert f"theta: 6 to {np.degrees(in_degrees.theta[-1]):.6g} deg" in str(in_degrees)
+    # A table shows the least and the greatest value, in other words.
+    assert f"theta: 6 deg at the start, {np.degrees(in_degrees.theta[-1]):.6g} deg at the end" in str(in_degrees)
+    assert re.search(r"theta.*: \S+ to \S+", str(in_degrees.to_table()))
     (panel,) = in_degrees.plot("theta").axes
     assert_close(panel.get_lines()[0].get_ydata(), np.degrees(in_degrees.theta))
     assert in_degrees.plot("theta", unit="rad").axes[0].get_ylabel() == "inclination θ [rad]"

@@ -379,10 +379,11 @@ class AbstractTrajectory(AbstractRun):
     def in_words(self) -> str:
         word = self.status if isinstance(self.status, str) else Status(int(self.status)).word
         angle, factor = in_unit("rad", unit_of(self))
+        theta = factor * np.asarray(self.theta)
         lines = [
             f"Trajectory of {len(self.t)} times, {word} at {float(self.end_time):.6g} s",
             *([] if self.launch is None else [f"  {self.launch}"]),
-            f"  theta: {factor * float(self.theta[0]):.6g} to {factor * float(self.theta[-1]):.6g} {angle}",
+            f"  theta: {theta[0]:.6g} {angle} at the start, {theta[-1]:.6g} {angle} at the end",
         ]
         if self.dense is not None and isinstance(self.scene.body, AbstractBody):
             lines.append(f"  {self._whether_it_turned_over}")
