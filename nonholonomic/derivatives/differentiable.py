@@ -358,14 +358,18 @@ class LinearSolve(AbstractSolve):
         leaves, last = arguments[: -self.linear], arguments[-self.linear :]
         if self.parts is None:
             return self.of.push_forward(self.active, cells, leaves, last)
-        cotangents = dict(zip(self.parts, last, strict=True))
-        by_part = jax.tree.unflatten(self.structure, [cotangents.get(k) for k in range(self.structure.num_leaves)])
+        by_part = self.by_part(last)
         try:
             return self.of.pull_back(self.active, cells, leaves, by_part)
         except ValueError:
             # A loop without a fixed number of iterations has no backward pass.
             slopes = self.of.value_and_tangents(self.active, False, cells, *leaves)[1]
-            return [contracted(slope, by_part) for slope in slopes]
+            return [jax.vmap(contracted)(slope, by_part) for slope in slopes]
+
+    def by_part(self, cotangents: Leaves) -> Primal:
+        """The cotangents in a tree like the primal, with `None` for parts without one."""
+        of_parts = dict(zip(self.parts or (), cotangents, strict=True))
+        return jax.tree.unflatten(self.structure, [of_parts.get(k) for k in range(self.structure.num_leaves)])
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
         return dataclasses.replace(self, of=self.of.for_parts(wanted)) if self.parts is None else self
@@ -375,34 +379,24 @@ class LinearSolve(AbstractSolve):
 
         def of_cell(*arguments: Float[Array, "..."]) -> list[Array]:
             leaves, last = arguments[: -self.linear], arguments[-self.linear :]
-            slopes = [flat(slope)[0] for slope in _value_and_tangents(self.of, self.active)(*leaves)[1]]
-
-            def output(k: int) -> Array:
-                if self.parts is None:
-                    pairs = [(slope[k], tangent) for slope, tangent in zip(slopes, last, strict=True)]
-                else:
-                    pairs = [
-                        (jnp.moveaxis(slopes[k][part], range(cotangent.ndim), range(-cotangent.ndim, 0)), cotangent)
-                        for part, cotangent in zip(self.parts, last, strict=True)
-                    ]
-                return sum((product(*pair) for pair in pairs), jnp.zeros(()))
-
-            return [output(k) for k in request.selection]
+            slopes = _value_and_tangents(self.of, self.active)(*leaves)[1]
+            if self.parts is not None:
+                return [contracted(slopes[k], self.by_part(last)) for k in request.selection]
+            pairs = [(flat(slope)[0], tangent) for slope, tangent in zip(slopes, last, strict=True)]
+            return [sum((product(slope[k], by) for slope, by in pairs), jnp.zeros(())) for k in request.selection]
 
         if not any(request.batch_flags):
             return [part[None] for part in of_cell(*arguments)]
         return jax.vmap(of_cell, tuple(0 if flag else None for flag in request.batch_flags))(*arguments)
 
 
-def contracted(slope: Primal, cotangents: Primal) -> Float[Array, "cells ..."]:
-    """The derivative of a sum over the primal in every cell, from the derivative of the primal, the axes of the leaf last, and
-    its cotangents; a derivative that is zero counts for nothing, whatever the cotangent."""
-    total = jnp.zeros(())
-    for part, cotangent in zip(flat(slope)[0], flat(cotangents)[0], strict=True):
-        if part is not None and cotangent is not None:
-            weights = cotangent.reshape(*cotangent.shape, *[1] * (part.ndim - cotangent.ndim))
-            total += jnp.where(part == 0.0, 0.0, part * weights).sum(axis=tuple(range(1, cotangent.ndim)))
-    return total
+def contracted(slope: Primal, cotangents: Primal) -> Float[Array, "..."]:
+    """The derivative of a sum over the primal of a cell, from the derivative of the primal, the axes of the leaf last, and its
+    cotangents."""
+    pairs = zip(flat(slope)[0], flat(cotangents)[0], strict=True)
+    present = [(part, by) for part, by in pairs if part is not None and by is not None]
+    own_last = [(jnp.moveaxis(part, range(by.ndim), range(-by.ndim, 0)), by) for part, by in present]
+    return sum((product(*pair) for pair in own_last), jnp.zeros(()))
 
 
 def product(slope: Float[Array, "..."], tangent: Float[Array, "..."]) -> Float[Array, "..."]:

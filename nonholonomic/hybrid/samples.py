@@ -382,7 +382,7 @@ class HybridSampling(AbstractSampling):
     ) -> list[Lanes]:
         if cells == 1 and len(active) <= MOST_FORWARD_ALONE:
             slopes = self.value_and_tangents(active, False, cells, *leaves)[1]
-            return [contracted(slope, cotangents) for slope in slopes]
+            return [jax.vmap(contracted)(slope, cotangents) for slope in slopes]
         build, numbers, (times, t1, settings, _), _ = self.builder(cells, leaves)
         rebuilt, point = by_active(build, active, numbers, cells)
         times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], (len(times), cells))
