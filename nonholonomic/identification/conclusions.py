@@ -1,6 +1,7 @@
 """What a fit concludes: a verdict, intervals, profile likelihoods, and the shape of the posterior in words."""
 
 import math
+import re
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -72,7 +73,7 @@ class Verdict(NamedTuple):
     def __str__(self) -> str:
         """Whether to believe the fit, and what to do; `Identification.details` has the statistics."""
         if self.concerns:
-            return f"do not rely on this fit yet: {'; '.join(self.concerns)}"
+            return "\n  ".join(["do not rely on this fit yet:", *self.concerns])
         if math.isnan(self.p_value):
             return f"no concerns, but {self.notes[0]}"
         return "no concerns about this fit" + (
@@ -114,39 +115,39 @@ def judge(
     if np.any(measurements.estimated):
         untested = "nothing tests this fit, as its errors come from its own residuals: pass `error`"
     untested += f"; held fixed as if exact: {fixed}" if fixed else ""
-    fixed += ", held fixed, may be wrong (free them, with priors), " if fixed else ""
+    fixed = f", and {fixed}, which were held fixed" if fixed else ""
     impossible, share = without_prediction(explorer, sample, distribution)
     minima, concerns, notes = (), (), ()
     if distribution.kind == "weights":
         minima, (concerns, notes) = minima_of(explorer, sample), remarks(explorer, sample, distribution, by_slopes)
+    # The most important first; the details have the statistics.
     concerns = (
         *sentences(
-            (status != "converged", "the fit has not converged: allow more steps (max_steps), or start closer"),
-            (
-                distribution.kind == "none",
-                "there are no errors and intervals, because too few likely points were found: start closer, give bounds or "
-                "priors, or fix numbers",
-            ),
-            (len(minima) > 1, f"the data allow {len(minima)} minima: " + "; ".join(map(str, minima))),
+            (status != "converged", "the fit has not converged: start closer, or allow more steps (max_steps)"),
             (missing, f"the model has no prediction for {missing} measurements: its run ends earlier, or fails"),
             (
+                distribution.kind == "none",
+                "there are no errors and intervals: start closer, give bounds or priors, or fix numbers",
+            ),
+        ),
+        *(_undetermined(words) for words in unseen),
+        *sentences(
+            (len(minima) > 1, f"the data allow {len(minima)} minima, which the details list: state a prior or bounds"),
+            (
                 p_value < POOR,
-                f"the residuals are too large (p = {p_value:.2g}), so the intervals are not valid: {fixed}the model is wrong, "
-                "the errors are too small, or this is not the best minimum",
+                f"the residuals are too large for the intervals to be valid: check the model and the errors{fixed}",
             ),
             (violated, f"{violated} limits are violated by more than {FAR:.0f} errors"),
             (
                 p_trend < POOR,
-                f"the residuals keep their sign for too long (p = {p_trend:.2g}): the model misses a trend, or "
-                "errors are correlated",
+                "the residuals keep their sign for too long: the model misses a trend, or errors are correlated",
             ),
             (
                 share > CUT,
-                f"{impossible}; of those beside the estimate, {100.0 * share:.0f} %: simulate a run there to see why",
+                f"{100.0 * share:.0f} % of the candidates beside the estimate count as impossible: simulate a run there",
             ),
         ),
         *concerns,
-        *(f"the data do not determine {words}" for words in unseen),
     )
     notes = (
         *sentences(
@@ -156,8 +157,9 @@ def judge(
                 f"{outside}: outside of the range in which minima were searched, so better ones may be missing; start closer, "
                 "or state a prior",
             ),
-            (impossible and share <= CUT, impossible),
+            (impossible, impossible),
         ),
+        *(f"minimum: {minimum}" for minimum in minima if len(minima) > 1),
         *notes,
     )
     return Verdict(
@@ -172,6 +174,13 @@ def judge(
         k=sample.k,
         minima=minima,
     )
+
+
+def _undetermined(words: str) -> str:
+    """The concern about a combination of parameters, which is given in words such as "mass +1 %, length -1 %"."""
+    names = [re.split(r" [+-]", part)[0] for part in words.split(", ")]
+    remedy = "fix one of them" if len(names) > 1 else "fix it"
+    return f"the data do not determine {' and '.join(names)}: {remedy}, or give a prior"
 
 
 def sentences(*table: tuple[object, str]) -> tuple[str, ...]:
@@ -497,7 +506,9 @@ def remarks(
         low, high = quantiles(values[:, k], weights, np.array([0.025, 0.975]))
         for bound in (problem.unknowns.lower[k], problem.unknowns.upper[k]):
             if np.isfinite(bound) and np.sum(weights[np.abs(values[:, k] - bound) < NEAR * (high - low)]) > CUT:
-                concerns.append(f"the bound {explorer.density.written(name, float(bound))} cuts the interval of {name}")
+                concerns.append(
+                    f"the bound {explorer.density.written(name, float(bound))} cuts the interval of {name}: widen it"
+                )
         low, high = distribution.interval(k, 1.96)
         sides = high - distribution.estimate[k], distribution.estimate[k] - low
         if max(sides) > SKEWED * max(min(sides), 1e-300):
@@ -511,5 +522,5 @@ def remarks(
     for verb, factors in (("understate", ratios), ("overstate", 1.0 / ratios)):
         worst = int(np.argmax(factors))
         if factors[worst] > FACTOR:
-            notes.append(f"slopes {verb} the errors {factors[worst]:.1f} times ({problem.names[worst]}): {reason}")
+            notes.append(f"slopes {verb} the errors {factors[worst]:.2g} times ({problem.names[worst]}): {reason}")
     return tuple(concerns), tuple(notes)

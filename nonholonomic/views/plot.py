@@ -67,7 +67,8 @@ def new_figure(width: float = 7.0, height: float = 4.5) -> "Figure":
 
 def draw_title(figure: "Figure", text: str) -> None:
     """Write a title of as many lines as it needs above all of a figure."""
-    figure.suptitle(textwrap.fill(text, int(figure.bbox_inches.width / PANEL[0] * WIDTH)), fontsize="medium")
+    width = int(figure.bbox_inches.width / PANEL[0] * WIDTH)
+    figure.suptitle("\n".join(textwrap.fill(line, width) for line in text.splitlines()), fontsize="medium")
 
 
 def draw_table(

@@ -82,9 +82,10 @@ def fitted_with_limit(limit, effect):
 
 def test_candidates_whose_runs_fail_are_counted_and_placed():
     """Beside the estimate they cut its interval; far from it, they are a note."""
-    with pytest.warns(FitWarning, match="candidates count as impossible.* at rate 2.0.*of those beside the estimate"):
+    with pytest.warns(FitWarning, match=r"^\d+ % of the candidates beside the estimate count as impossible"):
         fit = fitted_with_limit(2.03, 1.0)
     assert fit.interval("rate")[1] < 2.03
+    assert re.search(r"note: \d+ of \d+ candidates count as impossible.* at rate 2.0", fit.details)
     fit = fitted_with_limit(3.5, 1.0)
     assert fit.verdict.good
     count, of_all = (int(re.search(r"(\d+) of (\d+) candidates", fit.details).group(k)) for k in (1, 2))
@@ -99,7 +100,7 @@ def test_a_number_that_does_not_act_is_seen_at_once():
         fit = fitted_with_limit(100.0, 1e-13)
     assert [str(warning.message) for warning in caught] == [
         "no prediction depends on level, so the data say nothing about it: fix it, or add other data",
-        "the data do not determine level +0.001",
+        "the data do not determine level: fix it, or give a prior",
     ]
     assert len(fit.distribution.points) == 256
     assert np.isinf(fit.standard_errors["level"])
@@ -214,8 +215,9 @@ def test_a_report_states_values_with_intervals_and_what_to_do_before_any_statist
     apart = dataclasses.replace(fit, most_likely={**fit.most_likely, "rate": moved})
     assert f"; most likely {moved:.4g})" in str(apart)
     doubtful = dataclasses.replace(fit, verdict=fit.verdict._replace(concerns=("start closer", "allow more steps")))
-    assert "verdict: do not rely on this fit yet: start closer; allow more steps" in str(doubtful)
-    assert doubtful.plot().get_suptitle() == "do not rely on this fit yet: start closer; allow more steps"
+    assert "verdict: do not rely on this fit yet:\n  start closer\n  allow more steps\n" in str(doubtful)
+    assert doubtful.plot().get_suptitle().split() == str(doubtful.verdict).split()
+    assert len(doubtful.plot().get_suptitle().splitlines()) == 3
 
 
 @pytest.mark.parametrize(
