@@ -32,8 +32,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from ..hybrid import AbstractBatchedMode, HybridOutcome
-from ..integration import Settings
-from ..integration.problem import Status
+from ..integration.problem import Settings, Status
 from ..kernels import HybridRuns, HybridStart, Part, javascript
 from ..terminal import status_line
 from ..text import Unit, require_unit, shown, unit_of

@@ -15,10 +15,9 @@ from nonholonomic.geometry import Plane
 from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit, shown
 from nonholonomic.validation import explaining, require_flag, require_kind, require_package, require_whole
-from nonholonomic.views import DARK, Body, Mesh, Page, Stage
-from nonholonomic.views.pages import page, require_page
+from nonholonomic.views.pages import Page, page, require_page
 from nonholonomic.views.plot import draw_title, new_figure
-from nonholonomic.views.stage import bar, curves_in, fixed, of_grid, own
+from nonholonomic.views.stage import DARK, Body, Mesh, Stage, bar, curves_in, fixed, of_grid, own
 
 from ..model.scene import Dynamics, Launch, Number, Scene, padded
 from ..runs.model import simulate

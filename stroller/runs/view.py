@@ -10,8 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic import views
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem
-from nonholonomic.integration.problem import Status
+from nonholonomic.integration.problem import AbstractPassive, AbstractProblem, ExtendedProblem, Status
 from nonholonomic.parameters import numbers
 from nonholonomic.runs.model import Sliders
 from nonholonomic.runs.trajectory import TOLERANCE, explore_model, live_run, page_of, runs_at_ends, sliders_of

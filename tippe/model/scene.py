@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic import validation
-from nonholonomic.geometry import AbstractSurface, Component, Cylinder, Plane, Sphere, Torus, Vector
 from nonholonomic.geometry.frames import AbstractFrame, PlaneFrame, frame_of, place_named
-from nonholonomic.geometry.surface import as_surface
-from nonholonomic.geometry.vector import cross, dot, none_if_zero, scale, sum_vectors
+from nonholonomic.geometry.surface import AbstractSurface, Cylinder, Plane, Sphere, Torus, as_surface
+from nonholonomic.geometry.vector import Component, Vector, cross, dot, none_if_zero, scale, sum_vectors
 from nonholonomic.integration import Components, States
 from nonholonomic.parameters import as_one, numbers
 from nonholonomic.text import Stated, likely_fix, shown

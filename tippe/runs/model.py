@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from nonholonomic.compilation.xla_cpu import compiled_setup
-from nonholonomic.geometry import Cylinder, Plane, Sphere, cross, scale, sum_vectors
-from nonholonomic.geometry.frames import CarriedFrame
+from nonholonomic.geometry import CarriedFrame, Cylinder, Plane, Sphere, cross, scale, sum_vectors
 from nonholonomic.geometry.vector import planar_length
 from nonholonomic.hybrid import BETWEEN, AbstractBatchedMode, HybridOutcome
 from nonholonomic.integration import AbstractProblem, CoreProblem, Outcome

@@ -13,8 +13,7 @@ from jaxtyping import Array, Float, Int
 from nonholonomic.compilation.cache import padded
 from nonholonomic.geometry import Component, Pose, Vector, dot, rate_in_frame, scale, stacked, sum_vectors
 from nonholonomic.hybrid import HybridPath
-from nonholonomic.integration import DenseSolution
-from nonholonomic.integration.dense import all_crossings
+from nonholonomic.integration.dense import DenseSolution, all_crossings
 from nonholonomic.integration.problem import Status
 from nonholonomic.parameters import description
 from nonholonomic.runs.model import AbstractModel, Number, model_of

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic import views
 from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import Settings
-from nonholonomic.integration.problem import REACHED_END
+from nonholonomic.integration.problem import REACHED_END, Settings
 from nonholonomic.parameters import numbers, numbers_of, with_numbers
 from nonholonomic.runs.event import Ensemble
 from nonholonomic.runs.model import Sliders
