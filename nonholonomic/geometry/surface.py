@@ -24,20 +24,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..compilation.components import held, map_methods
 from ..text import shown
 from ..validation import Bound, Bounded, Usual, as_number, require
-from .vector import (
-    Component,
-    Vector,
-    difference,
-    dot,
-    multiply,
-    none_if_zero,
-    planar_length,
-    scale,
-    subtract,
-    sum_vectors,
-    tangents,
-    unit,
-)
+from .vector import Component, Vector, difference, dot, multiply, none_if_zero, planar_length, scale, tangents, unit
 
 #: A surface, or a value that the checks of a scene reject.
 Other = TypeVar("Other")
@@ -157,7 +144,7 @@ class AbstractSurface(Bounded):
         """
         foot = tuple(0.0 * centre[0] if part is None else part for part in self.nearest(centre))
         normal = scale(side, self.normal(foot))
-        return BallGap(foot, normal, subtract(dot(difference(centre, foot), normal), radius))
+        return BallGap(foot, normal, dot(difference(centre, foot), normal) - radius)
 
     def offset(self, position: Vector) -> Component:
         """Distance [m] of a position close to the surface, exact, or to first order if that is cheaper."""
@@ -254,8 +241,7 @@ class AbstractGradientSurface(AbstractSurface):
         gradient, gradient_rate = self.gradient(position), self.gradient_rate(position, velocity)
         per_size = 1.0 / jnp.sqrt(dot(gradient, gradient))
         normal = scale(per_size, gradient)
-        along_normal = scale(subtract(None, dot(normal, gradient_rate)), normal)
-        return scale(per_size, sum_vectors(gradient_rate, along_normal))
+        return scale(per_size, difference(gradient_rate, scale(dot(normal, gradient_rate), normal)))
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> Vector:
         # The gradient's size changes the normal only along n, which is perpendicular to a and b.

@@ -15,7 +15,7 @@ from test_hops import scene_of
 
 import tippe
 from tippe.model.dynamics import angular_velocity
-from tippe.modes.impact import BOTH, FreeBody, LeaningDynamics, at_rest, balls
+from tippe.modes.impact import BOTH, FreeBody, LeaningDynamics, balls
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 
@@ -128,7 +128,7 @@ def test_coming_to_rest_along_the_normal():
     tilt = random.normal(scale=1e-6, size=20)
     states[5:7] += tilt * np.stack([-states[3], states[2]])
     free_before = FreeBody.of(scene.body, spheres[1], jnp.asarray(states))
-    free_after: FreeBody = at_rest(scene.body, free_before)
+    free_after: FreeBody = LeaningDynamics.of(scene).at_rest(free_before)
     for ball in spheres:
         assert_close(free_after.gap_rate(scene.body, ball), 0.0, atol=1e-16)
         assert_close(jellett(ball, free_after), jellett(ball, free_before), atol=1e-20)

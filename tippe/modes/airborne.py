@@ -26,19 +26,7 @@ from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNI
 from ..model.body import Top
 from ..model.dynamics import COS_THETA, Dynamics, Motion, from_frame, joined, parts, to_frame
 from ..model.scene import Scene
-from .impact import (
-    TOUCHING,
-    Ball,
-    FreeBody,
-    Strike,
-    axis_rate,
-    balls,
-    closing_speed,
-    own_and_other,
-    standing_on,
-    still_parting,
-    strike,
-)
+from .impact import Ball, FreeBody, axis_rate, balls, own_and_other, standing_on, still_parting, strike
 from .problems import STEM_COSINE, AbstractFlyingMode, InversionProblem, Quadratures, Started, c_rate
 
 #: The mode numbers. The last two are those of a top with a stem: the stem slides; or a sphere is about to strike, and
@@ -407,7 +395,10 @@ class Fly(AbstractFlyingMode):
         blow = strike(scene, contact_ball, free)
         throws = rests = takes_over = no
         if other_ball is not None:
-            throws, rests = _at_other(scene, flying, ground, other_ball, blow)
+            velocity, momentum = (from_frame(part, ground.axes) for part in (blow.free.velocity, blow.free.momentum))
+            after, site = flying._replace(velocity=velocity, momentum=momentum), landing_site(scene, flying, other_ball)
+            bodies = (flying_body(scene, motion, site, other_ball) for motion in (flying, after))
+            throws, rests = blow.at_other(scene, site.gap, *(part.gap_rate(scene.body, other_ball) for part in bodies))
             takes_over = (state[LAST_BALL] == 0.0) & ((number == 1) | rests) & ~misses & self.awaits_stem
         flies = blow.rebounds | throws
         state_after = jnp.where(flies, in_flight(flying.place, ground.axes, blow.free), in_contact(ground, blow.free))
@@ -428,26 +419,6 @@ class Fly(AbstractFlyingMode):
             crossing_time=jnp.where(takes_over, 0.0, jnp.inf),
             counts=(blow.rebounds & ~throws).astype(int)[None],
         )
-
-
-def _at_other(
-    scene: Scene[Top], flying: FlightState, ground: Below, other_ball: Ball, blow: Strike
-) -> tuple[Bool[Array, " cells"], Bool[Array, " cells"]]:
-    """Effect of an impact on the other sphere: whether it is thrown into the arena; and whether the top comes to rest on
-    both spheres.
-
-    **Arguments:** `flying`: the top before the impact; `ground`: the arena below the sphere that strikes.
-    """
-    after = flying._replace(
-        velocity=from_frame(blow.free.velocity, ground.axes), momentum=from_frame(blow.free.momentum, ground.axes)
-    )
-    site, closing = landing_site(scene, flying, other_ball), closing_speed(scene)
-    rate_before, rate_after = (
-        flying_body(scene, motion, site, other_ball).gap_rate(scene.body, other_ball) for motion in (flying, after)
-    )
-    touches = site.gap < TOUCHING * scene.body.radius
-    rests = touches & blow.is_slow & (jnp.abs(rate_before) <= closing)
-    return touches & ~rests & (rate_after < -closing), rests
 
 
 def airborne_modes(scene: Scene[Top], problem: InversionProblem, last: bool, with_quadratures: bool = False) -> Started:

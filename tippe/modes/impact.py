@@ -337,6 +337,15 @@ class Strike(NamedTuple):
     is_slow: Bool[Array, " cells"]
     fails: Bool[Array, " cells"]
 
+    def at_other(
+        self, scene: Scene[Top], gap: Lanes, before: Lanes, after: Lanes, may_rest: Bool[Array, " cells"] | bool = True
+    ) -> tuple[Bool[Array, " cells"], Bool[Array, " cells"]]:
+        """Effect of the impact on the other sphere: whether it is thrown into the arena; and whether the top comes to rest on
+        both. **Arguments:** `gap`: its distance from the arena [m], with its rates before and after the impact [m/s]."""
+        touches, closing = gap < TOUCHING * scene.body.radius, closing_speed(scene)
+        rests = touches & self.is_slow & (jnp.abs(before) <= closing) & may_rest
+        return touches & ~rests & (after < -closing), rests
+
 
 def closing_speed(scene: Scene[Top]) -> Float[Array, "..."]:
     """The speed [m/s] of a rebound below which the contact closes."""
@@ -643,26 +652,25 @@ class LeaningDynamics(AbstractDynamics):
         **Returns:** the body, exactly at rest along the normal (`at_rest`); `BOTH`, or the number of the sphere on
         which it stands; and whether this is the only solution.
         """
-        free = at_rest(self.body, free)
+        free = self.at_rest(free)
         state = free.contact_state
         number = jnp.where(self.contact_margin(state) > 0.0, BOTH, self.heavier(state))
         return free, number, self.motion(state).definiteness > INDEFINITE
 
+    def at_rest(self, free: FreeBody) -> FreeBody:
+        """A body whose spheres are both at the plane, with its remaining speeds along the normal removed.
 
-def at_rest(body: Top, free: FreeBody) -> FreeBody:
-    """A body whose spheres are both at the plane, with its remaining speeds along the normal removed.
-
-    theta becomes the angle at which both spheres touch. L loses its component along n x e, the only one that changes
-    theta; impulses along the normal at both spheres would have this effect. L.n, L.e, Jellett's quantity of either
-    sphere and the slip do not change; the energy decreases by the energy of the removed motion.
-    """
-    main, stem = balls(body)
-    e, L = free.axis, free.momentum
-    c = jnp.broadcast_to((stem.radius - main.radius) / (stem.offset - main.offset), e[2].shape)
-    square = e[0] ** 2 + e[1] ** 2
-    # The length of e is unchanged.
-    factor = jnp.sqrt((square + e[2] ** 2 - c**2) / square)
-    perpendicular = (-e[1], e[0])
-    L = (*sum_vectors(L[:2], scale(-dot(perpendicular, L[:2]) / square, perpendicular)), L[2])
-    velocity = (free.velocity[0], free.velocity[1], jnp.zeros_like(c))
-    return FreeBody(velocity, main.radius - main.offset * c, (*scale(factor, e[:2]), c), L)
+        theta becomes the angle at which both spheres touch. L loses its component along n x e, the only one that changes
+        theta; impulses along the normal at both spheres would have this effect. L.n, L.e, Jellett's quantity of either
+        sphere and the slip do not change; the energy decreases by the energy of the removed motion.
+        """
+        main, stem = balls(self.body)
+        e, L = free.axis, free.momentum
+        c = jnp.broadcast_to((stem.radius - main.radius) / (stem.offset - main.offset), e[2].shape)
+        square = e[0] ** 2 + e[1] ** 2
+        # The length of e is unchanged.
+        factor = jnp.sqrt((square + e[2] ** 2 - c**2) / square)
+        perpendicular = (-e[1], e[0])
+        L = (*sum_vectors(L[:2], scale(-dot(perpendicular, L[:2]) / square, perpendicular)), L[2])
+        velocity = (free.velocity[0], free.velocity[1], jnp.zeros_like(c))
+        return FreeBody(velocity, main.radius - main.offset * c, (*scale(factor, e[:2]), c), L)

@@ -29,20 +29,7 @@ from nonholonomic.integration.problem import CROSSED, FAILED, LEFT_DOMAIN, REACH
 from ..model.body import Number, Top
 from ..model.dynamics import COS_THETA, Dynamics, parts
 from ..model.scene import Scene
-from .impact import (
-    TOUCHING,
-    Ball,
-    FreeBody,
-    LeaningDynamics,
-    at_rest,
-    balls,
-    closing_speed,
-    own_and_other,
-    select,
-    standing_on,
-    still_parting,
-    strike,
-)
+from .impact import Ball, FreeBody, LeaningDynamics, balls, own_and_other, select, standing_on, still_parting, strike
 from .problems import AbstractFlyingMode, InversionProblem, Quadratures, Started
 
 #: Most intervals between inflections that are searched for a landing; the search skips those where the top is too high.
@@ -300,14 +287,11 @@ def land(scene: Scene[Top], air: Air) -> Air:
     after_impact = air._replace(free=blow.free, rising=blow.rebounds, open=blow.rebounds, status=status)
     if other_ball is not None:
         # The other sphere also strikes if it is at the plane, or the top comes to rest on both.
-        closing = closing_speed(scene)
-        touches = air.free.gap(other_ball) < TOUCHING * scene.body.radius
-        falls = touches & (blow.free.gap_rate(scene.body, other_ball) < -closing)
         leaning = LeaningDynamics.of(scene)
         stopped_body, dissipates = leaning.stopped(air.free)
-        rests = touches & blow.is_slow & (jnp.abs(air.free.gap_rate(scene.body, other_ball)) <= closing) & dissipates
+        rates = (free.gap_rate(scene.body, other_ball) for free in (air.free, blow.free))
+        falls, rests = blow.at_other(scene, air.free.gap(other_ball), *rates, may_rest=dissipates)
         free, number, definite = leaning.settled(stopped_body)
-        falls &= ~rests
         after_impact = after_impact._replace(
             free=select(rests, free, blow.free),
             ball=jnp.where(rests, number, jnp.where(falls, 1 - air.ball, air.ball)),
@@ -504,9 +488,9 @@ class Lean(AbstractFlyingMode):
 
     def reset_map(self, state: States, left: Lanes) -> Transition:
         """Slide on the sphere whose normal force has not vanished."""
-        number, body = LeaningDynamics.of(self.scene).heavier(state), self.scene.body
-        state_at_rest = at_rest(body, FreeBody.of(body, balls(body)[0], state)).contact_state
-        state = jnp.concatenate([state_at_rest, state[OWN:]])
+        leaning, body = LeaningDynamics.of(self.scene), self.scene.body
+        number, free = leaning.heavier(state), leaning.at_rest(FreeBody.of(body, balls(body)[0], state))
+        state = jnp.concatenate([free.contact_state, state[OWN:]])
         zero = jnp.zeros_like(state[0])
         running, zeros = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
         leaves_sphere = (number == 1) & self.awaits_stem & self.last
