@@ -221,20 +221,22 @@ def _draw_lines(
     has_number = np.isfinite(lines)
     lost = np.full(lines.shape, "") if words is None else np.where(has_number, "", words.reshape(lines.shape))
     marks = dict(zip(filter(None, np.unique(lost).tolist()), "x+1234", strict=False))
-    strip = drawing
+    # A row of the strip for each line that has such cells.
+    rows = np.cumsum(np.any(lost != "", axis=0)) - 1
+    strip, last = drawing, int(rows[-1])
     if marks:
         # Outside of the scale of the values, and above the strips of earlier plots in these axes.
         ends = [child.bbox.transformed(drawing.transAxes.inverted()).y1 for child in drawing.child_axes]
-        place = 0.0, max([1.0, *ends]), 1.0, MARK * (1 + lines.shape[1])
-        strip = drawing.inset_axes(place, sharex=drawing, facecolor="0.9", ylim=(-1.0, lines.shape[1]))
-        strip.set_yticks([0.5 * (lines.shape[1] - 1)], ["\n".join(marks).replace("_", " ")], fontsize="small")
+        place = 0.0, max([1.0, *ends]), 1.0, MARK * (2 + last)
+        strip = drawing.inset_axes(place, sharex=drawing, facecolor="0.9", ylim=(-1.0, last + 1.0))
+        strip.set_yticks([0.5 * last], ["\n".join(marks).replace("_", " ")], fontsize="small")
         strip.tick_params(length=0.0, labelbottom=False)
     for index, line in enumerate(lines.T):
         texts = [label or "", _cut_text(table, names[1], index) if len(names) > 1 else ""]
         text = ", ".join(filter(None, texts))
         (curve,) = drawing.plot(values, line, marker, markersize=3, label=text or None)
         for word, mark in marks.items():
-            strip.plot(values, np.where(lost[:, index] == word, index, np.nan), mark, color=curve.get_color())
+            strip.plot(values, np.where(lost[:, index] == word, rows[index], np.nan), mark, color=curve.get_color())
     for word, mark in marks.items() if len(marks) > 1 else ():
         drawing.plot([], [], mark, color="0.35", label=word.replace("_", " "))
     if not np.any(has_number):

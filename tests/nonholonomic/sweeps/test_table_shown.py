@@ -134,6 +134,15 @@ def test_lines_without_a_time_say_why_they_are_empty():
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["contact lost", "not inverted"]
     marks = [line.get_xdata()[np.isfinite(line.get_ydata())].tolist() for line in axes.child_axes[0].lines]
     assert marks == [[SPIN[1]], [SPIN[0], SPIN[2]]]
+    # Seven lines, one of which has such cells: the strip has one row, as for a single line.
+    columns = {name: np.tile(none[name][:, None], 7) for name in ("time", "status")}
+    columns["time"][:, 1:] = 1.0
+    (drawn, *_) = Table({"spin": SPIN[:3], "y": np.arange(7.0)}, columns, {}, {}).plot().axes
+    heights = []
+    for panel in (axes, drawn):
+        panel.figure.draw_without_rendering()
+        heights.append(panel.child_axes[0].get_window_extent().height / panel.get_window_extent().height)
+    assert_close(*heights, rtol=1e-9)
 
 
 def test_cells_without_a_time_are_marked_and_named():
