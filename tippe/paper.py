@@ -76,20 +76,14 @@ SURFACES |= {"paraboloid P": Paraboloid, "plane TILT": Plane}
 SAMPLES = 3000
 
 
-class Help(argparse.ArgumentDefaultsHelpFormatter):
-    """Show the default of every option that has one."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        return action.help if action.default is None else super()._get_help_string(action)
-
-
 def parser() -> argparse.ArgumentParser:
     """The options of the main job; the defaults are the declared top and the papers' launches."""
     command = argparse.ArgumentParser(
         prog="python -m tippe --paper",
         description="Inversion times of a tippe top inside a cylinder (the paper's Tables 2 and 3) and on the plane. "
         "Prints them beside the published times, writes an HDF5 table for each arena and a picture of theta(t).",
-        formatter_class=Help,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        argument_default=argparse.SUPPRESS,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
     top = command.add_argument_group("the top (the numbers of the paper's Table 1 are lost; these are Rutstam's)")
@@ -144,16 +138,15 @@ class Arena(NamedTuple):
 def arenas_of(options: argparse.Namespace) -> dict[str, Arena]:
     """The two arenas of the papers, and the requested arena, by the names of their files."""
     inertia = options.mass * options.radius**2
-    I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
-    I3 = 0.4 * inertia if options.I3 is None else options.I3
-    top = Top(options.mass, options.radius, options.offset, I1, I3)
+    moments = {"I1": 131.0 / 350.0 * inertia, "I3": 0.4 * inertia} | vars(options)
+    top = Top(options.mass, options.radius, options.offset, moments["I1"], moments["I3"])
     friction: AbstractFriction = Viscous(options.mu)
-    if options.slip_speed is not None:
+    if "slip_speed" in options:
         friction = Coulomb(options.mu, options.slip_speed)
     surfaces = {"cylinder": ("cylinder", Cylinder(options.cylinder_radius)), "plane": ("plane", Plane())}
-    if options.surface is not None:
+    if "surface" in options:
         surfaces["surface"] = (" ".join(options.surface), surface_of(options.surface))
-    spin, arenas = options.beta1 / float(top.I3) if options.spin is None else options.spin, {}
+    spin, arenas = options.spin if "spin" in options else options.beta1 / float(top.I3), {}
     for file, (name, surface) in surfaces.items():
         counts_eta = any(coordinate == "eta" for coordinate, _ in surface.coordinates)
         scene = Scene(top, surface, friction, options.gravity)

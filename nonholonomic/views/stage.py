@@ -93,11 +93,6 @@ class Curve(NamedTuple):
     values: Float[np.ndarray, " times"]
     factor: float = 1.0
 
-    @property
-    def label(self) -> str:
-        """The name with the unit."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
-
 
 class Show(NamedTuple):
     """The drawing of one run: `size` is a length [m] of the body, and `colour` the colour of its curves.

@@ -180,7 +180,7 @@ def test_arrows_are_labelled_in_their_units_and_switched_off(browser, top):
 def test_curves_and_arrows_tell_the_same_between_frames(browser, stages):
     """Both are on the straight line between frames; the nearer frame would be 0.4 % off, where the force swings fast."""
     show = stages[0].shows[0]
-    force = next(curve.values for curve in show.curves if curve.label == "normal force [N]")
+    force = next(curve.values for curve in show.curves if curve.name == "normal force")
     swing = int(np.argmax(np.abs(np.diff(force))))
     time_in_page = float(0.51 * show.times[swing] + 0.49 * show.times[swing + 1])
     expected = 0.51 * force[swing] + 0.49 * force[swing + 1]
