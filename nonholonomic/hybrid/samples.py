@@ -170,10 +170,19 @@ def sampled_rounds(
         return after, output._replace(state=state, number=jnp.where(is_new, runs.mode, output.number))
 
     def reset(numbers: Sequence[int], cell: Int[Array, " cells"], _: Int[Array, ""], carry: Carry) -> Carry:
-        (runs, output), times_here = carry, times[:, cell]
-        transition, rows = _reset(numbers, cell, runs)
-        after = ensemble.after_reset(runs, transition, t1[cell])
+        (runs, output), times_here, horizon = carry, times[:, cell], t1[cell]
+
+        def with_rows(
+            mode: AbstractBatchedMode, state: States, left: Lanes
+        ) -> tuple[ensemble.Transition, Array | None]:
+            # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
+            return reset_with_rows(mode, state, left, times_here - horizon + left, horizon)
+
+        mode = ensemble.mode_numbered(of_cells(modes, cell), numbers, runs.mode)
+        transition, rows, variations = mode.reset_with_path(runs.state, ensemble.time_left(runs, horizon), with_rows)
+        after = ensemble.after_reset(runs, transition, horizon)
         if rows is not None:
+            rows = jnp.concatenate([rows[None], variations])
             is_new = (times_here > runs.end_time) & (times_here <= after.end_time) & jnp.isnan(output.number)
             between, number = jnp.where(is_new, rows, output.between), jnp.where(is_new, BETWEEN, output.number)
             output = output._replace(between=between, number=number)
@@ -181,26 +190,17 @@ def sampled_rounds(
         grazing_time = jnp.where(grazes, jnp.minimum(output.grazing_time, runs.end_time), output.grazing_time)
         return after, output._replace(grazing_time=grazing_time)
 
-    def _reset(
-        numbers: Sequence[int], cell: Int[Array, " cells"], runs: Runs
-    ) -> tuple[ensemble.Transition, Array | None]:
-        """The transition of some cells, and its output rows with their variations."""
-        horizon = t1[cell]
-
-        def with_rows(
-            mode: AbstractBatchedMode, state: States, left: Lanes
-        ) -> tuple[ensemble.Transition, Array | None]:
-            # If the event happens later, less time passes from the event to a fixed time, and to the horizon.
-            return reset_with_rows(mode, state, left, times[:, cell] - horizon + left, horizon)
-
-        mode = ensemble.mode_numbered(of_cells(modes, cell), numbers, runs.mode)
-        transition, rows, variations = mode.reset_with_path(runs.state, ensemble.time_left(runs, horizon), with_rows)
-        return transition, None if rows is None else jnp.concatenate([rows[None], variations])
-
     groups, size = ensemble.program_groups(modes), times.shape[1]
-    rows = [jax.eval_shape(functools.partial(_reset, group), jnp.arange(size), start)[1] for group in groups]
-    between = next((jnp.zeros(shape.shape) for shape in rows if shape is not None), None)
-    missing = jnp.full((len(start.state), *times.shape), jnp.nan)
+    missing, state = jnp.full((len(start.state), *times.shape), jnp.nan), modes[0].parts(start.state)[0][:-1]
+
+    def records(mode: AbstractBatchedMode) -> bool:
+        return isinstance(mode, AbstractHoppingMode) or jax.eval_shape(mode.reset_map, state, t1).record is not None
+
+    between = None
+    # The resets with their variations would have the same shapes, and take long to trace.
+    if any(records(modes[group[0]].mode) for group in groups):
+        shown, variations = jax.eval_shape(over_cells(VariationalMode.output_rows, modes[0]), missing)
+        between = jnp.zeros((1 + len(variations), *shown.shape))
     empty = Recorded(missing, missing[0], between, jnp.full(size, jnp.inf))
     return (start, empty), groups, solve, reset
 

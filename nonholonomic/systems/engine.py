@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..compilation.components import over_cells, over_lanes
 from ..compilation.tracing import in_cells
-from ..compilation.xla_cpu import least
+from ..compilation.xla_cpu import compiled_setup, least
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import AbstractProblem, Components, Jumps, Lanes, States
 from ..integration.problem import CROSSED, FAILED, LEFT_DOMAIN, RUNNING
@@ -97,6 +97,7 @@ class ModeProblem(AbstractProblem):
         falls = jnp.where(is_tangential, falls, slope < 0.0) & (value <= ROUND_OFF / self.mode.tolerance * error)
         return jnp.any(jnp.where(is_near, falls, value <= 0.0), axis=0)
 
+    @compiled_setup
     def at_start(self) -> tuple[Array, ...]:
         """The margins at the start; their slopes along the motion; the errors of both if the error of every component is the
         tolerance, and whether value and slope are such errors."""
@@ -164,6 +165,9 @@ def _in_lanes(form: Form, name: str, mode: int, numbers: Sequence[Array], parts:
 #: A large field is a function of its own in every program, which JAX traces, differentiates and lowers once.
 _in_lanes_out_of_line = jax.jit(_in_lanes, static_argnums=(0, 1, 2))
 
+#: A small one is traced once, too, but becomes part of the program.
+_in_lanes_inline = jax.jit(_in_lanes, static_argnums=(0, 1, 2), inline=True)
+
 
 class BatchedMode(AbstractBatchedMode):
     """A user's mode as a mode of the engine.
@@ -187,7 +191,7 @@ class BatchedMode(AbstractBatchedMode):
     def in_lanes(self, name: str, state: Components) -> PyTree:
         """A function of the mode (`Form.function`) in every lane."""
         is_large = name == "field" and self.form.traits.large[self.index]
-        evaluate = _in_lanes_out_of_line if is_large else _in_lanes
+        evaluate = _in_lanes_out_of_line if is_large else _in_lanes_inline
         return evaluate(self.form, name, self.index, self.numbers, tuple(state))
 
     def problem(self, state: Float[Array, "components *cells"]) -> ModeProblem:
