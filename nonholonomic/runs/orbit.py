@@ -80,7 +80,7 @@ class Newton(NamedTuple):
     - `count`: number of returns so far; `state`: (components, cells); `stage`: 1 after all cells have converged, 2 after a step
       at the finer tolerance, 3 after the check of the drive; `reason`: as for `Orbit`, where the search has been given up;
       `iterations`.
-    - `in_motion`, `time`, `by_state`, `time_by_state`: of the last return; `inverse`: of 1 - J.
+    - `in_motion`, `time`, `by_state`: of the last return; `inverse`: of 1 - J.
     - `residual`, `step`: by how much the last return missed, and the length of the last step.
     """
 
@@ -92,7 +92,6 @@ class Newton(NamedTuple):
     in_motion: Array
     time: Array
     by_state: Array
-    time_by_state: Array
     inverse: Array
     residual: Array
     step: Array
@@ -333,7 +332,6 @@ class OrbitSolve(EventTime):
                 new.in_motion,
                 new.time + jnp.einsum("cn,nc->c", new.time_by_state, change),
                 new.by_state,
-                new.time_by_state,
                 inverse,
                 jnp.where(is_bad, old.residual, residual),
                 length,
@@ -342,7 +340,7 @@ class OrbitSolve(EventTime):
 
         zeros, whole, none = jnp.zeros(cells), jnp.zeros(cells, int), jnp.zeros((), int)
         reason = jnp.where(is_legal, whole, ILLEGAL)
-        matrices = (jnp.zeros((cells, size, size)), jnp.zeros((cells, size)), jnp.zeros((cells, len(self.free), size)))
+        matrices = (jnp.zeros((cells, size, size)), jnp.zeros((cells, len(self.free), size)))
         of_last = (jnp.zeros(cells, bool), zeros, *matrices, zeros, zeros)
         begin = Newton(none, start, none, reason, whole, *of_last)
         return jax.lax.while_loop(lambda newton: newton.stage < 2 + is_checked, step, begin)
