@@ -5,6 +5,7 @@ lane, so write it with `jax.numpy` and without `if`. Use an `equinox.Module` for
 """
 
 import contextlib
+import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Float, PyTree
 
 from nonholonomic.compilation.components import Held, TooLarge, by_components, over_last_axis
@@ -216,6 +217,20 @@ class Formula(eqx.Module):
             run = jax.vmap(run)
         return tuple(run(*leaves))
 
+    def of_cells(self, cells: int, t: Float[Array, ""], motion: Motion) -> "PerRide":
+        """The input for a number of rides, with arguments such as these. A number or an array of the function may be one for
+        all rides, or have the rides in its first axis."""
+        of_one, of_all, program = [], [], self.program.program
+        assert isinstance(program, ClosedJaxpr)
+        for part, own in zip(self.held, program.in_avals, strict=False):
+            differs = part.ndim > own.ndim
+            of_one.append(part[0] if differs else part)
+            spreads = eqx.is_inexact_array(part) and part.ndim
+            shared = jnp.broadcast_to(part[..., None], (*part.shape, cells)) if spreads else part
+            of_all.append(jnp.moveaxis(part, 0, -1) if differs else shared)
+        by_elements = PerRide.of(dataclasses.replace(self, held=tuple(of_one)), t, motion).by_elements
+        return PerRide(dataclasses.replace(self, held=tuple(of_all)), by_elements)
+
 
 # Inputs that are written for a single ride, for many rides at once.
 
@@ -248,15 +263,6 @@ class PerRide(eqx.Module):
             jax.eval_shape(by_components(of_ride, *example), *example)
             return cls(controls, is_elementary(of_ride, *example))
         return cls(controls, False)
-
-    def of_cells(self, cells: int) -> "PerRide":
-        """The same input for a number of rides."""
-
-        def spread(leaf: PyTree) -> PyTree:
-            is_array = eqx.is_inexact_array(leaf) and leaf.ndim
-            return jnp.broadcast_to(leaf[..., None], (*leaf.shape, cells)) if is_array else leaf
-
-        return PerRide(jax.tree.map(spread, self.function), self.by_elements)
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         shape = np.broadcast_shapes(*map(jnp.shape, jax.tree.leaves((t, motion))))

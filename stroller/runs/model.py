@@ -190,7 +190,7 @@ class RideModel(AbstractSceneModel):
         if controls is not None:
             arguments = inputs.example_arguments(scene, launch)
             if cells is not None and isinstance(controls, Formula) and inputs.has_arrays(controls):
-                controls = PerRide.of(controls, *arguments).of_cells(cells)
+                controls = controls.of_cells(cells, *arguments)
             times = inputs.jump_times(controls, self.jumps, *arguments, cells)
         parts = [scene.state(launch, controls is not None), scene.scales(launch, controls is not None)]
         if cells is not None:

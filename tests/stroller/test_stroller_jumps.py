@@ -30,6 +30,22 @@ def place(start, width, impulse=6.0, time=2.0):
     return time + impulse / 12.0 * (time - start - 0.5 * width)
 
 
+def test_the_functions_of_many_rides_may_hold_other_numbers():
+    """Under `jax.vmap`, arrays and numbers of an input may differ from ride to ride, or be one for all."""
+    shared = jnp.array([0.5, 0.2])
+
+    def time(gain, own):
+        def push(t, motion):
+            return 12.0 * gain * (own[0] * shared[0] + own[1] * shared[1] * t), 0.0
+
+        return nonholonomic.event_time(SCENE, LAUNCH, 2.0, lambda t, motion: 1.2 - motion.speed, input=push)
+
+    gains, ones = jnp.array([1.0, 2.0, 4.0]), jnp.ones((3, 2))
+    times = jax.vmap(time)(gains, gains[:, None] * ones)
+    # gain^2 (t / 2 + t^2 / 10) = 0.2
+    assert_close(times, (jnp.sqrt(0.25 + 0.08 / gains**2) - 0.5) / 0.2, atol=1e-9)
+
+
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-9])
 @pytest.mark.parametrize("width", [1e-2, 1e-3])
 def test_no_push_is_missed(width, tolerance):
