@@ -167,8 +167,9 @@ class VariationalMode(AbstractBatchedMode):
         directions = self.directions([variation[:-1] - rates * variation[-1] for variation in variations])
         return along(output, (primal, *numbers), directions)
 
-    def slopes(self, state: States) -> Float[Array, "tangents cells"]:
-        """The derivative of the time of the event at which runs have ended in this mode, or in the transition to it."""
+    def slopes(self, state: States, end_time: Lanes) -> Float[Array, "tangents cells"]:
+        """The derivative of the time of the event at which runs have ended in this mode at a time [s], or in the transition to
+        it."""
         primal, *variations = self.parts(state)
         numbers, build = self.active_numbers()
 
@@ -179,10 +180,17 @@ class VariationalMode(AbstractBatchedMode):
             # The event was located to a small fraction of a step, and the variations also change over the remaining
             # time.
             rates = problem.field(start_time, primal)
-            value, rate = stop_gradient(jax.jvp(problem.event_function, (primal,), (rates,)))
-            remainder = -value / jnp.where(rate == 0.0, jnp.inf, rate)
-            primal = primal + jnp.where(jnp.abs(remainder) < NEARLY * duration, remainder, 0.0) * rates
-            return start_time + delay(problem.event_function, primal, problem.field(start_time, primal))
+            margin = functools.partial(problem.margin_or_one, duration)
+            to_event, to_end = (stop_gradient(_remainder(of, primal, rates)) for of in (problem.event_function, margin))
+            point = primal + jnp.where(jnp.abs(to_event) < NEARLY * duration, to_event, 0.0) * rates
+            at_event = start_time + delay(problem.event_function, point, problem.field(start_time, point))
+            if self.ends_on_event:
+                return at_event
+            # A reset that jumps over the zero of the event is the event: that at the end of this mode, or the one before it.
+            far, near = jnp.abs(to_event) > NEARLY * end_time, NEARLY * end_time
+            at_end = start_time + delay(margin, primal, rates)
+            of_reset = jnp.where(jnp.abs(to_end) <= near, at_end, start_time)
+            return jnp.where(far & (jnp.minimum(jnp.abs(to_end), duration) <= near), of_reset, at_event)
 
         duration, point = primal[-1], (primal[:-1], jnp.zeros_like(primal[-1]), *numbers)
         directions = self.directions([part[:-1] for part in variations], [part[-1] for part in variations])
@@ -211,6 +219,12 @@ class VariationalMode(AbstractBatchedMode):
     def directions(self, *moves: list[Array]) -> list[tuple[Array, ...]]:
         """For each tangent the rates at which some arrays move, followed by those of the active numbers."""
         return [(*arrays, *jax.tree.leaves(tangent)) for *arrays, tangent in zip(*moves, self.tangents, strict=True)]
+
+
+def _remainder(function: Callable[[States], Lanes], state: States, rates: States) -> Lanes:
+    """The time after which a function of the state vanishes, to first order; infinite where it rests."""
+    value, rate = jax.jvp(function, (state,), (rates,))
+    return jnp.where(rate == 0.0, jnp.inf, -value / jnp.where(rate == 0.0, 1.0, rate))
 
 
 def moved_with_event(problem: AbstractProblem, state: States, duration: Lanes) -> tuple[States, Lanes]:
@@ -310,7 +324,11 @@ def solve_hybrid_with_tangents(
         # the last row.
         slopes = xp.reshape(ended.state, (1 + len(group), -1, len(ended.mode)))[1:, -1]
         for number, of_mode in enumerate(variational):
-            slopes = xp.where(ended.mode == number, xp.asarray(slopes_of(of_mode, jnp.asarray(ended.state))), slopes)
+            slopes = xp.where(
+                ended.mode == number,
+                xp.asarray(slopes_of(of_mode, jnp.asarray(ended.state), jnp.asarray(ended.end_time))),
+                slopes,
+            )
         event_time = ended.crossing_time if ends_on_event else xp.broadcast_to(t1, ended.mode.shape)
         # An event at the start has a fixed time, whatever the tangent.
         has_event = xp.isfinite(event_time) & (event_time > 0.0)

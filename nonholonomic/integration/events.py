@@ -237,6 +237,10 @@ STATE_SHARE = 0.25
 #: margin, or a run has just passed its event.
 AT_ZERO = 1e-9
 
+#: A step in which a function falls ends past the zero on a chord by this share of the rest of the part. To end with the part
+#: would cut a millionth of the step again and again, if the part that follows is that short.
+PAST = 0.125
+
 #: The shortest parts that are bounded, as a fraction of the step: at its start, which may be on a zero, and elsewhere.
 SHORTEST_FIRST, SHORTEST = 2.0**-12, 2.0**-30
 
@@ -371,7 +375,10 @@ def _bounded(functions: Callable[[Lanes, States], Functions], path: Path, free: 
         hides = jnp.any(~positive & ~falls & hidden, axis=0) & may_cut
         running = begin < 1.0
         is_fall, is_cut = running & decided & ~clear, running & ~decided & hides
-        place = jnp.where(is_fall & (end < 1.0), end, jnp.where(is_cut, jnp.maximum(begin, 0.25), place))
+        # Past the zero: the middle, or a little more than the zero of the chord from there to the end.
+        beyond = jnp.where(value > 0.0, end - (1.0 - PAST) * half * at_end / (at_end - value), middle)
+        just_past = jnp.min(jnp.where(positive, jnp.inf, jnp.where(is_short, end, beyond)), axis=0)
+        place = jnp.where(is_fall & (end < 1.0), just_past, jnp.where(is_cut, jnp.maximum(begin, 0.25), place))
         begin = jnp.where(is_fall | is_cut, 1.0, jnp.where(running & clear, end, begin))
         return begin, jnp.where(clear, 2.0, 0.5) * width, place
 
@@ -408,7 +415,9 @@ def _looked(functions: Callable[[Lanes, States], Functions], path: Path, may_cut
     falls = (value[1:] <= 0.0) | (least < -total) & (least < -AT_ZERO * jnp.maximum(value[1:], value[:-1]))
     hides = jnp.where(begins, unresolved, least < total) & ~falls & may_cut
     begin, end = places[:-1, None, None], places[1:, None, None]
-    at_fall = jnp.where(value[1:] <= 0.0, jnp.where(end < 1.0, end, 2.0), begin + inner * width)
+    zero = begin + width * value[:-1] / (value[:-1] - value[1:])
+    just_past = jnp.where(value[:-1] > 0.0, zero + PAST * (end - zero), end)
+    at_fall = jnp.where(value[1:] <= 0.0, jnp.where(end < 1.0, just_past, 2.0), begin + inner * width)
     place = jnp.where(falls, at_fall, jnp.where(hides, jnp.maximum(begin, 0.25), jnp.inf))
     place, problems = jnp.min(place, axis=1), jnp.any(falls | hides, axis=1)
     first = jnp.argmax(problems, axis=0)

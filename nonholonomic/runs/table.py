@@ -17,6 +17,7 @@ from jax.extend.core import Literal
 from jaxtyping import Array, Float, Int, PyTree
 
 from .. import sweeps
+from ..compilation.tracing import TracedFunction
 from ..compilation.xla_cpu import programs_in
 from ..derivatives import tangent_scale, tangents_by
 from ..hybrid import HybridOutcome
@@ -325,6 +326,7 @@ def has_users_code(part: object) -> bool:
         return any(has_users_code(getattr(part, field.name)) for field in dataclasses.fields(part))
     if isinstance(part, tuple | list | dict):
         return any(map(has_users_code, part.values() if isinstance(part, dict) else part))
+    part = part.function if isinstance(part, TracedFunction) else part
     # Functions can also be compiled or methods. An object that can be called, such as a partial function, has data.
     is_own = str(getattr(part, "__module__", "")).partition(".")[0] in PACKAGES
     return callable(part) and not (is_own and hasattr(part, "__qualname__"))

@@ -79,6 +79,31 @@ def test_arrays_of_numpy_in_a_batch_inside_jit(time):
         assert all(part.shape == (2,) for part in jax.tree.leaves(jax.eval_shape(jax.jit(function), 0.3)))
 
 
+def test_the_penalty_of_a_lost_contact_has_the_derivative_of_its_value():
+    """The contact is lost earlier or later, at another theta. Second derivatives there are refused."""
+
+    def time(mu, spin):
+        scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(mu))
+        return tippe.extended_inversion_time(scene, tippe.Launch(0.1, spin), 6.0, tolerance=1e-9)
+
+    # One program for all derivatives.
+    moved = jax.jit(lambda mu, spin, *rates: jax.jvp(time, (mu, spin), rates))
+    value, by_mu = moved(0.3, 200.0, 1.0, 0.0)
+    assert 6.0 < value < 12.0
+    for slope, step in ((by_mu, (1e-4, 0.0)), (moved(0.3, 200.0, 0.0, 1.0)[1], (0.0, 0.1))):
+        above, below = (moved(0.3 + sign * step[0], 200.0 + sign * step[1], 1.0, 0.0)[0] for sign in (1.0, -1.0))
+        assert_close(slope, (above - below) / (2.0 * sum(step)), rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_penalty_of_a_lost_contact_has_no_second_derivative():
+    def time(mu):
+        scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(mu))
+        return tippe.extended_inversion_time(scene, tippe.Launch(0.1, 200.0), 6.0, tolerance=1e-9)
+
+    assert np.isnan(jax.jit(jax.hessian(time))(0.3))
+
+
 @pytest.mark.slow
 def test_second_derivative():
     """jax.hessian against differences of the gradient."""

@@ -1,5 +1,6 @@
 """The functions for launches of a top: single runs, inversion times, tables."""
 
+import functools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
@@ -16,7 +17,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from nonholonomic.compilation.xla_cpu import greatest, least
 from nonholonomic.derivatives import VariationalProblem, differentiable_solve, in_groups, tangents_by
 from nonholonomic.integration import Lanes, Settings, crossing_time, solve_ensemble
-from nonholonomic.integration.problem import CROSSED, DEFAULT_MAX_STEPS, FAILED, MOST_STEPS, Status, require_run
+from nonholonomic.integration.problem import (
+    CROSSED,
+    DEFAULT_MAX_STEPS,
+    FAILED,
+    LEFT_DOMAIN,
+    MOST_STEPS,
+    Status,
+    event_time,
+    require_run,
+)
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.runs.attractors import LyapunovExponent, exponent_of_model
 from nonholonomic.runs.event import EventTime, time_of_event
@@ -804,7 +814,8 @@ def extended_inversion_time(
     continues the time C / s with the same value and slope at `t1`.
 
     The function works under `jit`, `vmap`, `grad`, `jvp` and their compositions. The derivatives of the time (implicit
-    function theorem) and of the penalty are with respect to every number except `t1` and `tolerance`.
+    function theorem) and of the penalty are with respect to every number except `t1` and `tolerance`. Second derivatives are
+    NaN where the contact was lost.
 
     **Arguments:**
 
@@ -860,16 +871,22 @@ class ExtendedTime(EventTime):
         options = {"one_kernel": not nested, "n_blocks": 1 + len(tangents), "traced": True}
         outcome, _ = solve_ensemble(variational, t1, jnp.asarray(cells), settings, **options)
         state, *variations = variational.parts(outcome.state)
-        has_crossed = outcome.status == CROSSED
+        has_crossed, is_lost, ended = outcome.status == CROSSED, outcome.status == LEFT_DOMAIN, outcome.end_time
 
         def extended(problem: InversionProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
             # A cell that starts beyond the angle has reached it at time 0.
-            time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
-            end, start = (inclination(parts(states).axis) for states in (state, problem.states))
+            time = jnp.where(ended > 0.0, crossing_time(problem, ended, state), 0.0)
+            # Where the contact is lost, the end varies with the time of the loss.
+            loss = event_time(problem, functools.partial(problem.margin_or_one, ended), ended, state)
+            later = jnp.where(is_lost, loss - jax.lax.stop_gradient(loss), 0.0)
+            at_end = state + later * problem.field(ended, state)
+            end, start = (inclination(parts(states).axis) for states in (at_end, problem.states))
             return jnp.where(has_crossed, time, beyond_horizon(end, start, jnp.arccos(problem.cos_angle), t1))
 
         is_good = is_legal & (outcome.status != FAILED)
         times = jnp.where(is_good, extended(problem, state), jnp.nan)
+        # Second derivatives through a loss of contact would lack the second variation of its time.
+        is_good &= ~(is_lost & nested)
         slopes = [
             jnp.where(is_good, eqx.filter_jvp(extended, (problem, state), direction)[1], jnp.nan)
             for direction in zip(tangents, variations, strict=True)

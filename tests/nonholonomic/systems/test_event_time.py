@@ -407,3 +407,31 @@ def test_a_start_may_be_a_list_of_traced_numbers():
     fall = jax.vmap(lambda height: event_time(Hybrid([Ball()], event=Bounces(1.0)), [height, 0.0, 0.0], 2.0))
     heights = jnp.array([0.5, 1.0])
     assert_close(fall(heights), jnp.sqrt(2.0 * heights / GRAVITY), rtol=1e-12)
+
+
+class Counting(AbstractMode):
+    """A falling ball, whose third component counts the bounces."""
+
+    restitution: float
+
+    def field(self, t, y):
+        return jnp.array([y[1], -9.81, 0.0])
+
+    def margin(self, t, y):
+        return y[0]
+
+    def reset(self, t, y):
+        return jnp.array([0.0, -self.restitution * y[1], y[2] + 1.0]), 0
+
+
+@pytest.mark.parametrize("crossing", ["first", "last"])
+def test_the_time_of_an_event_at_a_reset_has_the_derivative_of_the_reset(crossing):
+    """The third bounce, at sqrt(2 / g) (1 + 2 e + 2 e^2)."""
+
+    def time(restitution):
+        bounces = Hybrid([Counting(restitution)], lambda t, y: 2.5 - y[2])
+        return event_time(bounces, jnp.array([1.0, 0.0, 0.0]), 1.9, crossing=crossing)
+
+    value, slope = jax.value_and_grad(time)(0.8)
+    assert_close(value, np.sqrt(2.0 / 9.81) * (1.0 + 1.6 + 1.28), rtol=1e-8)
+    assert_close(slope, np.sqrt(2.0 / 9.81) * (2.0 + 3.2), rtol=1e-6)

@@ -195,6 +195,49 @@ def test_a_block_on_a_shaken_table_sticks_slips_flies_and_lands():
     assert_close(ends[0], ends[1], atol=1e-4)
 
 
+class Stuck(AbstractMode):
+    """A mass on a belt at 0.38 m/s, against a spring, until the grip fails; the floor shakes."""
+
+    def grip(self, t):
+        return 0.4944 * (9.81 - 14.1 * jnp.sin(33.24 * t + 86.88))
+
+    def field(self, t, y):
+        return jnp.array([0.3815, 0.0])
+
+    def margin(self, t, y):
+        return self.grip(t) ** 2 - (33.86 * y[0]) ** 2
+
+    def reset(self, t, y):
+        return y, 1
+
+
+class Sliding(Stuck):
+    """Until it sticks again, or strikes a wall that is near."""
+
+    def field(self, t, y):
+        return jnp.array([y[1], self.grip(t) - 33.86 * y[0]])
+
+    def margin(self, t, y):
+        return {"sticks": 0.3815 - y[1], "wall": 0.1085 - y[0]}
+
+    def reset(self, t, y, exit):
+        return y, 2
+
+
+class Waiting(AbstractMode):
+    def field(self, t, y):
+        return jnp.zeros(2)
+
+
+def test_a_wall_soon_after_the_grip_fails_is_found_in_few_trials():
+    """The margin for sticking begins with slope 0. The step before the wall was once cut by a few thousandths, thousands of
+    times, or for ever."""
+    run = simulate(Hybrid([Stuck(), Sliding(), Waiting()]), [0.093448, 0.3815], 0.05, times=[0.05], tolerance=1e-10)
+    assert list(run.resets["margin"]) == ["0", "wall"]
+    assert_close(run.state[-1, 0], 0.1085, rtol=1e-12)
+    assert int(run.rejected) < 20
+
+
 @needs_browser
 def test_the_browser_lifts_the_mass_as_the_closed_form_does():
     live = page_of(model_of(lifted(3.0), [0.0, 0.0]), {"modes[*].pull": (3.0, 9.0)}, 5.0)[0]
