@@ -221,7 +221,7 @@ class VariationalMode(AbstractBatchedMode):
         return [(*arrays, *jax.tree.leaves(tangent)) for *arrays, tangent in zip(*moves, self.tangents, strict=True)]
 
 
-def _remainder(function: Callable[[States], Lanes], state: States, rates: States) -> Lanes:
+def _remainder(function: Callable[[States], Lanes | None], state: States, rates: States) -> Lanes:
     """The time after which a function of the state vanishes, to first order; infinite where it rests."""
     value, rate = jax.jvp(function, (state,), (rates,))
     return jnp.where(rate == 0.0, jnp.inf, -value / jnp.where(rate == 0.0, 1.0, rate))

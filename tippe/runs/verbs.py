@@ -1,6 +1,5 @@
 """The functions for launches of a top: single runs, inversion times, tables."""
 
-import functools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
@@ -12,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.lax import stop_gradient
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.compilation.xla_cpu import greatest, least
@@ -24,7 +24,6 @@ from nonholonomic.integration.problem import (
     LEFT_DOMAIN,
     MOST_STEPS,
     Status,
-    event_time,
     require_run,
 )
 from nonholonomic.parameters import numbers, with_numbers
@@ -877,9 +876,10 @@ class ExtendedTime(EventTime):
             # A cell that starts beyond the angle has reached it at time 0.
             time = jnp.where(ended > 0.0, crossing_time(problem, ended, state), 0.0)
             # Where the contact is lost, the end varies with the time of the loss.
-            loss = event_time(problem, functools.partial(problem.margin_or_one, ended), ended, state)
-            later = jnp.where(is_lost, loss - jax.lax.stop_gradient(loss), 0.0)
-            at_end = state + later * problem.field(ended, state)
+            rates = stop_gradient(problem.field(ended, state))
+            margin, rate = jax.jvp(lambda point: problem.margin_or_one(ended, point), (state,), (rates,))
+            later = jnp.where(is_lost, (stop_gradient(margin) - margin) / stop_gradient(rate), 0.0)
+            at_end = state + later * rates
             end, start = (inclination(parts(states).axis) for states in (at_end, problem.states))
             return jnp.where(has_crossed, time, beyond_horizon(end, start, jnp.arccos(problem.cos_angle), t1))
 
