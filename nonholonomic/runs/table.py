@@ -295,7 +295,7 @@ def at_the_end(
 
 @eqx.filter_jit
 def _with_tangents(
-    model: AbstractModel, columns: Cells, names: tuple[str, ...], tolerance: Number, size: int, continues: bool
+    model: AbstractModel, columns: dict[str, Any], names: tuple[str, ...], tolerance: Number, size: int, continues: bool
 ) -> tuple[Ensemble, tuple[Ensemble, ...], list[Float[Array, "..."]]]:
     """The runs of all cells, the tangents along the named parameters, and the scale of each tangent."""
 

@@ -169,7 +169,7 @@ def check_reversible(scene: Scene, launch: Launch, values: Mapping[str, object] 
         raise ValueError("spin = 0.0 must not be zero: a spin of zero cannot reverse")
 
 
-def check_event(angle: ArrayLike | None, crossing: object, known: tuple[str, ...] = ("first", "last")) -> None:
+def check_event(angle: Any, crossing: object, known: tuple[str, ...] = ("first", "last")) -> None:
     """Raise `ValueError` unless the angle is `None` or in (0, pi], and the crossing is a known word."""
     if angle is not None:
         require(angle, "angle", above=0.0, at_most=math.pi, unit="rad")

@@ -69,7 +69,9 @@ def test_it_says_on_a_terminal_what_it_does(regression, monkeypatch):
             line, Measurements(value, ERROR), {"height": 0.5, "slope": 0.0}, starts=3, progress=progress
         )
         assert second_fit.estimates == fit.estimates
-        assert [text.startswith("compiling") for _, text in stream.lines[:1]] == [True] * progress
+        # The first look may come before the first program is compiled.
+        words = {text.split()[0] for _, text in stream.lines}
+        assert ("compiling" in words, bool(words)) == (progress, progress)
 
 
 def test_a_model_without_derivatives_is_fitted_by_differences(regression):
