@@ -65,7 +65,7 @@ def new_figure(width: float = 7.0, height: float = 4.5) -> "Figure":
     return figure
 
 
-def draw_title(figure: "Figure", text: str) -> None:
+def draw_title(figure: Any, text: str) -> None:
     """Write a title of as many lines as it needs above all of a figure."""
     width = int(figure.bbox_inches.width / PANEL[0] * WIDTH)
     figure.suptitle("\n".join(textwrap.fill(line, width) for line in text.splitlines()), fontsize="medium")
