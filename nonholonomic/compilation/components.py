@@ -523,7 +523,8 @@ def map_methods(kind: type, names: Sequence[str]) -> None:
 
 def held(value: Any, evaluate: Function) -> Any:
     """A user's object with `Numbers` in place of its arrays if these hold the numbers of a single run. Arrays with one
-    number per lane stay as they are, and so do these packages' own objects.
+    number per lane stay as they are, and so do these packages' own objects. If the methods of a user's class read other
+    numbers from elsewhere than before, all compiled programs are cleared.
 
     **Arguments:** `evaluate`: evaluates the object for single numbers; if a result is an array, the object has one number
     per lane.

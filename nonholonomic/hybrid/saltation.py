@@ -180,16 +180,15 @@ class VariationalMode(AbstractBatchedMode):
             # The event was located to a small fraction of a step, and the variations also change over the remaining
             # time.
             rates = problem.field(start_time, primal)
-            margin = functools.partial(problem.margin_or_one, duration)
-            to_event, to_end = (stop_gradient(_remainder(of, primal, rates)) for of in (problem.event_function, margin))
+            to_event = stop_gradient(_remainder(problem.event_function, primal, rates))
             point = primal + jnp.where(jnp.abs(to_event) < NEARLY * duration, to_event, 0.0) * rates
             at_event = start_time + delay(problem.event_function, point, problem.field(start_time, point))
             if self.ends_on_event:
                 return at_event
             # A reset that jumps over the zero of the event is the event: that at the end of this mode, or the one before it.
-            far, near = jnp.abs(to_event) > NEARLY * end_time, NEARLY * end_time
-            at_end = start_time + delay(margin, primal, rates)
-            of_reset = jnp.where(jnp.abs(to_end) <= near, at_end, start_time)
+            margin, near = functools.partial(problem.margin_or_one, duration), NEARLY * end_time
+            to_end, at_end = stop_gradient(_remainder(margin, primal, rates)), start_time + delay(margin, primal, rates)
+            of_reset, far = jnp.where(jnp.abs(to_end) <= near, at_end, start_time), jnp.abs(to_event) > near
             return jnp.where(far & (jnp.minimum(jnp.abs(to_end), duration) <= near), of_reset, at_event)
 
         duration, point = primal[-1], (primal[:-1], jnp.zeros_like(primal[-1]), *numbers)

@@ -398,7 +398,7 @@ class Plain(eqx.Module):
         return self.function(direction)
 
 
-def as_support(value: Any) -> eqx.Module:
+def as_support(value: Any) -> Callable[..., Array] | eqx.Module:
     """Convert a support function to a module whose parameters are arrays.
 
     **Raises:** `ValueError` unless it returns one number for a vector of three.
@@ -420,10 +420,11 @@ def as_support(value: Any) -> eqx.Module:
         raise ValueError(f"support = {shown(value)} must give one number for a direction (3,), not {result}")
     if isinstance(value, eqx.Module):
         return value
-    closed = with_own_numbers(value, direction)
-    if isinstance(closed, eqx.Module):
-        return closed
-    return Plain(GivenFunction(value, jax.make_jaxpr(lambda direction: value(direction))(direction)))
+    # A new function, because JAX would not look again at what one that it knows reads from elsewhere.
+    program = jax.make_jaxpr(lambda direction: value(direction))(direction)
+    if any(map(is_traced, program.consts)):
+        return with_own_numbers(value, direction)
+    return Plain(GivenFunction(value, program))
 
 
 def evenly_spread(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
