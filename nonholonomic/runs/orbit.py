@@ -315,7 +315,7 @@ class OrbitSolve(EventTime):
             converged = residual <= CONVERGED * tolerance * scale
             converged &= ~settles & (length <= jnp.sqrt(tolerance) * scale)
             rests = extent <= CONVERGED * tolerance * jnp.maximum(scale, own)
-            rests &= new.in_motion & (not is_timed)
+            rests &= new.in_motion & ~settles & (not is_timed)
             misses = ~is_sound | (~converged & (old.count >= MOST_NEWTON))
             reason = jnp.select([is_bad, new.reason > 0, rests, misses], [old.reason, new.reason, 4, 3], 0)
             following = jnp.where(settles, settled, state + change)

@@ -372,6 +372,9 @@ def test_an_equilibrium_is_no_orbit_and_a_small_orbit_is_found():
         periodic_orbit(system, [0.9, 0.01, 0.3], rises, direction="rise", free=["y0"])
     small = periodic_orbit(Hybrid([Equilibrium(1e-9)]), [0.7e-9, 0.0, 0.0], rises, direction="rise")
     np.testing.assert_allclose(small.state[0], 1e-9, rtol=1e-10)
+    # A guess just before the section returns to it almost at once.
+    near = periodic_orbit(system, [0.9, -1e-9, 0.3], rises, direction="rise")
+    np.testing.assert_allclose(near.state, [1.0, 0.0, 0.3], atol=1e-11)
 
 
 def test_distinct_orbits_are_counted_once():
