@@ -224,7 +224,7 @@ def simulate(
     - `times`: times [s] to report, increasing, within [0, t1]; by default those of `tippe.simulate` for a top, and
       otherwise 201 equally spaced ones.
     - `solver`: an explicit Runge-Kutta solver of Diffrax; for scenes as for `tippe.simulate` and `stroller.simulate`.
-    - `adjoint`: for scenes, an adjoint method of Diffrax.
+    - `adjoint`: for scenes, `RecursiveCheckpointAdjoint()` or `ForwardMode()` of Diffrax.
 
     A run of your own system may have at most 2000 resets; then it ends as "unresolved". Inside transformations, samples after
     the end of a run are NaN, and their derivatives 0, so that a loss can leave them out.

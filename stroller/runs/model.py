@@ -357,7 +357,7 @@ def simulate(
       `diffrax.Dopri8()`; inside transformations without `adjoint`, if all numbers of scene and launch are scalars,
       `nonholonomic.integration.Oscillatory8()`.
     - `max_steps`: a run that needs more steps fails; at least 1.
-    - `adjoint`: an adjoint method of Diffrax, such as `RecursiveCheckpointAdjoint()`, with which Diffrax
+    - `adjoint`: `RecursiveCheckpointAdjoint()` or `ForwardMode()` of Diffrax, with which Diffrax
       differentiates. By default, this package computes forward and reverse derivatives; the gradient of a loss function
       costs about five runs, whatever the number of parameters, which may be arrays, such as the weights of an input.
     - `jumps`: times [s] at which the input jumps or has a kink, so that steps end there. The times of comparisons of the time

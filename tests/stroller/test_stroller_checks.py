@@ -74,7 +74,12 @@ BAD = [
     ),
     (
         lambda: stroller.simulate(FULL, LAUNCH, 1.0, adjoint="backwards"),
-        r"adjoint = 'backwards' must be one of Diffrax",
+        r"adjoint = 'backwards' must be RecursiveCheckpointAdjoint\(\) or ForwardMode\(\) of Diffrax",
+    ),
+    # It repeats steps of other lengths on its way back.
+    (
+        lambda: stroller.simulate(FULL, LAUNCH, 1.0, adjoint=diffrax.DirectAdjoint()),
+        r"adjoint = DirectAdjoint\(\) must be RecursiveCheckpointAdjoint",
     ),
     (lambda: stroller.simulate(FULL, LAUNCH, 1.0, times="soon"), r"times = 'soon' is not a number"),
     (lambda: stroller.simulate(FULL, LAUNCH, [1.0, 2.0]), r"t1 must be one number, not of shape \(2,\)"),

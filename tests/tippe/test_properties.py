@@ -16,8 +16,11 @@ from nonholonomic.integration import Settings, solve_ensemble
 from nonholonomic.integration.problem import FAILED, LEFT_DOMAIN, REACHED_END
 from tippe.modes.problems import InversionProblem
 
-# Scenes are scaled beyond the size of any top.
-pytestmark = pytest.mark.filterwarnings("ignore:.* for a top:UserWarning")
+# Scenes are scaled beyond the size of any top, and beyond any planet's gravity.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.* for a top:UserWarning"),
+    pytest.mark.filterwarnings("ignore:gravity = .* is large:UserWarning"),
+]
 
 #: Examples are drawn in batches of this many lanes, so that one compiled program runs them all.
 LANES = 16

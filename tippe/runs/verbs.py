@@ -595,7 +595,7 @@ def simulate(
     - `tolerance`: relative tolerance, in [1e-14, 1e-2]; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
     - `solver`: any adaptive solver of Diffrax for ordinary differential equations; by default `Dopri8()`; inside
       transformations without an `adjoint`, `nonholonomic.integration.Oscillatory8()`.
-    - `adjoint`: an adjoint method of Diffrax, such as `RecursiveCheckpointAdjoint()`, with which Diffrax integrates a
+    - `adjoint`: `RecursiveCheckpointAdjoint()` or `ForwardMode()` of Diffrax, with which Diffrax integrates a
       traced run. This is cheaper for a loss function with many parameters, but can miss a loss of contact shorter than
       a step. By default, this package computes forward and reverse derivatives, at the cost of about one run for each
       parameter.
