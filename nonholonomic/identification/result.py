@@ -286,13 +286,14 @@ class Identification:
         """The statistics behind the verdict, estimates with standard errors, the combinations of parameters that the data
         determine, and the residuals."""
         verdict, p_value, count = self.verdict, self.verdict.p_value, self.verdict.starts
+        errors = "no errors" if np.isnan([*self.standard_errors.values()]).all() else "errors"
         lines = [
             f"-2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
             *([] if math.isnan(p_value) else [f"residuals this large have a probability of {p_value:.2g}"]),
             *(f"{order.runs} runs of {order.count} signs (p = {order.p_value:.2g})" for order in verdict.series),
             f"{verdict.agree} of {count} refined candidates ended at the best minimum"
             + (", the others fit worse or were stopped early" if verdict.agree < count else ""),
-            f"errors from {verdict.effective:.0f} effective draws (k-hat {verdict.k:.2f})",
+            f"{errors} from {verdict.effective:.0f} effective draws (k-hat {verdict.k:.2f})",
             *(f"note: {note}" for note in verdict.notes),
             "estimates, standard errors, most likely values",
         ]

@@ -211,6 +211,9 @@ def test_a_report_states_values_with_intervals_and_what_to_do_before_any_statist
     noted = dataclasses.replace(fit, verdict=fit.verdict._replace(notes=("a staircase",)))
     assert "verdict: no concerns about this fit, 1 note in its details" in str(noted)
     assert "note: a staircase" in noted.details
+    assert "\nerrors from " in fit.details
+    unknown = dataclasses.replace(fit, standard_errors=dict.fromkeys(fit.standard_errors, math.nan))
+    assert "\nno errors from " in unknown.details
     moved = fit.estimates["rate"] + 0.5 * fit.standard_errors["rate"]
     apart = dataclasses.replace(fit, most_likely={**fit.most_likely, "rate": moved})
     assert f"; most likely {moved:.4g})" in str(apart)
