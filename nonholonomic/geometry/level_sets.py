@@ -28,52 +28,58 @@ from ..validation import UNTRACEABLE, Bound, as_number, is_traced
 from .surface import DIVIDED, NEWTON_STEPS, OPEN, TINY, AbstractGradientSurface, AbstractSurface, BallGap, Place
 from .vector import Component, Vector, difference, dot, scale, sum_vectors, tangents, unit
 
-# User functions for surfaces: convert them to modules with visible parameters, check them, and differentiate them.
+# Users' functions: convert them to modules with visible parameters, check them, and differentiate them.
 
 
 class Plain(eqx.Module):
     """A function without parameters; equal functions give the same program."""
 
     function: Callable[..., Component] = eqx.field(static=True)
+    signature: str | None = eqx.field(static=True, default=None, repr=False)
 
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
         # Users may compare, sort and look up numbers, or join them, which would mix lanes.
-        return jnp.vectorize(lambda *numbers: jnp.asarray(self.function(*numbers)))(*at)
+        return jnp.vectorize(lambda *numbers: jnp.asarray(self.function(*numbers)), signature=self.signature)(*at)
 
 
-def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> Any:
-    """Convert a function of lengths [m] to a module whose parameters are arrays.
+def as_function(value: Any, name: str, arguments: tuple[str, ...], vector: bool = False) -> Any:
+    """Convert a function of lengths [m], or of a unit vector, to a module whose parameters are arrays.
 
     **Raises:** `ValueError` unless the function returns one number for numbers.
     """
+    words = ", ".join(arguments)
     if not callable(value):
-        raise ValueError(f"{name} = {shown(value)} must be a function of ({', '.join(arguments)})")
+        raise ValueError(f"{name} = {shown(value)} must be a function of ({words})")
     if isinstance(value, eqx.Module):
         value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
-    zeros = (jnp.zeros(()),) * len(arguments)
+        if vector and any(np.ndim(leaf) and not is_traced(leaf) for leaf in jax.tree.leaves(value)):
+            return value
+    at = (jnp.array([0.0, 0.0, 1.0]),) if vector else (jnp.zeros(()),) * len(arguments)
     try:
         # A new function, because JAX would not look again at what one that it knows reads from elsewhere.
-        program = jax.make_jaxpr(lambda *numbers: value(*numbers))(*zeros)
+        program = jax.make_jaxpr(lambda *numbers: value(*numbers))(*at)
     except jax.errors.JAXTypeError as error:
         raise ValueError(f"{name} = {shown(value)} {UNTRACEABLE}") from error
-    except TypeError as error:
-        raise ValueError(f"{name} = {shown(value)} must be a function of ({', '.join(arguments)}): {error}") from error
+    except (TypeError, IndexError) as error:
+        raise ValueError(f"{name} = {shown(value)} must be a function of ({words}): {error}") from error
     # The parameters of a module may have one value per lane.
-    shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf))}
+    shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf) and not vector)}
     results = program.out_avals
     if len(results) != 1 or results[0].shape not in shapes or not jnp.issubdtype(results[0].dtype, jnp.floating):
-        names_of_results = ", ".join(map(str, results))
         raise ValueError(
-            f"{name} = {shown(value)} must return one number for numbers {', '.join(arguments)}, not {names_of_results}"
+            f"{name} = {shown(value)} must return one number for ({words}), not {', '.join(map(str, results))}"
         )
     if isinstance(value, eqx.Module):
         # If the parameters have one number per lane, so have the results.
-        of_one_run = results[0].shape == () and (len(shapes) > 1 or not _takes_lanes(value, len(arguments)))
+        of_one_run = not vector and results[0].shape == ()
+        of_one_run = of_one_run and (len(shapes) > 1 or not _takes_lanes(value, len(arguments)))
         return Held(parted(value)) if of_one_run and not isinstance(value, Held) else value
     if any(is_traced(constant) for constant in program.consts):
-        return Held(parted(with_own_numbers(value, *zeros)))
+        function = with_own_numbers(value, *at)
+        return function if vector else Held(parted(function))
     # Equinox warns of the arrays of a tree, such as JAX's partial functions, but not of those of its method.
-    return Plain(GivenFunction(value if jax.tree_util.all_leaves([value]) else value.__call__, program))
+    given = GivenFunction(value if jax.tree_util.all_leaves([value]) else value.__call__, program)
+    return Plain(given, "(n)->()" if vector else None)
 
 
 def _takes_lanes(function: Any, count: int) -> bool:

@@ -19,13 +19,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.compilation.components import over_lanes
-from nonholonomic.compilation.tracing import GivenFunction, with_own_numbers
 from nonholonomic.compilation.xla_cpu import stored
-from nonholonomic.geometry import AbstractFrame, Component, FrameMotion, Place, PlaneFrame, Tangent, Vector
+from nonholonomic.geometry import AbstractFrame, Component, FrameMotion, Place, PlaneFrame, Tangent, Vector, as_function
 from nonholonomic.geometry.vector import add, cross, dot, multiply, rate_in_frame, scale, subtract, sum_vectors
 from nonholonomic.integration import Components, States
 from nonholonomic.text import shown
-from nonholonomic.validation import UNTRACEABLE, ArrayOrList, Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import ArrayOrList, Bound, Bounded, as_number, is_traced
 
 from ..friction import AbstractFriction, ContactLoad, Slip
 from .dynamics import AXIS, AbstractContactDynamics, AbstractRollingDynamics, Motion, from_frame, parts, to_frame
@@ -336,7 +335,7 @@ class RigidBody(AbstractRigidBody):
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number, metadata=Bound.POSITIVE)
     inertia: Inertia = eqx.field(converter=Inertia.of)
-    support: Any = eqx.field(converter=lambda value: as_support(value))
+    support: Any = eqx.field(converter=lambda value: as_function(value, "support", ("direction (3,)",), vector=True))
     centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(
         converter=several("centre_of_mass", (3,), ALONG_AXES), default=(0.0, 0.0, 0.0)
     )
@@ -387,44 +386,6 @@ class RigidBody(AbstractRigidBody):
             return tuple(place), tuple(change)
 
         return over_lanes(of_one, leaves, *(scale(-1.0, vector) for vector in (normal, rate)))
-
-
-class Plain(eqx.Module):
-    """A support function without parameters; equal functions give the same program."""
-
-    function: Callable[..., Any] = eqx.field(static=True)
-
-    def __call__(self, direction: Float[Array, "3"]) -> Float[Array, ""]:
-        return self.function(direction)
-
-
-def as_support(value: Any) -> Callable[..., Array] | eqx.Module:
-    """Convert a support function to a module whose parameters are arrays.
-
-    **Raises:** `ValueError` unless it returns one number for a vector of three.
-    """
-    if not callable(value):
-        raise ValueError(f"support = {shown(value)} must be a function of a direction (3,)")
-    if isinstance(value, eqx.Module):
-        value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
-        if any(np.ndim(leaf) and not is_traced(leaf) for leaf in jax.tree.leaves(value)):
-            return value
-    direction = jnp.array([0.0, 0.0, 1.0])
-    try:
-        result = jax.eval_shape(value, direction)
-    except jax.errors.JAXTypeError as error:
-        raise ValueError(f"support = {shown(value)} {UNTRACEABLE}") from error
-    except (TypeError, IndexError) as error:
-        raise ValueError(f"support = {shown(value)} must be a function of a direction (3,): {error}") from error
-    if getattr(result, "shape", None) != () or not jnp.issubdtype(result.dtype, jnp.floating):
-        raise ValueError(f"support = {shown(value)} must give one number for a direction (3,), not {result}")
-    if isinstance(value, eqx.Module):
-        return value
-    # A new function, because JAX would not look again at what one that it knows reads from elsewhere.
-    program = jax.make_jaxpr(lambda direction: value(direction))(direction)
-    if any(map(is_traced, program.consts)):
-        return with_own_numbers(value, direction)
-    return Plain(GivenFunction(value, program))
 
 
 def evenly_spread(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -295,7 +295,7 @@ def test_a_tilt_may_be_traced_through_zero():
         (lambda: Paraboloid(-1.0), r"p = -1\.0 must be greater than 0\.0"),
         (lambda: Graph(3.0), r"height = 3\.0 must be a function of \(x, y\)"),
         (lambda: Graph(lambda x: x), r"height = .* must be a function of \(x, y\): .*1 positional argument"),
-        (lambda: Graph(lambda x, y: (x, y)), r"height = .* must return one number for numbers x, y, not"),
+        (lambda: Graph(lambda x, y: (x, y)), r"height = .* must return one number for \(x, y\), not"),
         (lambda: Graph(lambda x, y: jnp.stack([x, y])), r"height = .* must return one number .*, not float64\[2\]"),
         (lambda: Implicit(lambda x, y, z: x > y), r"function = .* must return one number .*, not bool"),
         (lambda: Sphere(1.0).sign("under", "inside"), r"side = 'under' must be one of 'outside', 'inside', 'above'"),
