@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..integration import AbstractProblem, CoreProblem, Outcome, Settings, sample, solve_with_samples
-from ..integration.problem import LEFT_DOMAIN, event_time
+from ..integration.problem import LEFT_DOMAIN, REACHED_END, event_time
 from ..validation import as_number
 from .adjoint import SampledCotangents, samples_pulled_back
 from .differentiable import AbstractDifferentiableSolve, Gradient, Leaves, Structure, differentiable_solve
@@ -136,7 +136,9 @@ def solve_for_samples(
     # Arrays, such as those of the solver, may be traced, so they belong to the leaves.
     arrays, rest = eqx.partition((numbers, (times, as_number(t1), settings, grid), others), eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
-    return differentiable_solve(sampling(build, axes, structure, rest), *leaves)
+    run = differentiable_solve(sampling(build, axes, structure, rest), *leaves)
+    later = jnp.where(run.status == REACHED_END, t1 - jax.lax.stop_gradient(t1), 0.0)
+    return run._replace(end_time=run.end_time + later)
 
 
 #: Build a problem from some modules (scene, launch, ...) and a number of cells, `None` for a single run.
@@ -226,22 +228,20 @@ def sampled_run(
     """
     if adjoint is not None:
         problem = build(modules, None)
-        outcome, states = sample(
-            probed(problem) if grid is None else problem, times, t1, settings, grid=grid, adjoint=adjoint
-        )
+        run = probed(problem) if grid is None else problem
+        outcome, states = sample(run, times, t1, settings, grid=grid, adjoint=adjoint)
         size = len(problem.start()[0])
         outcome = outcome._replace(state=outcome.state[:size])
         return _with_slopes(VariationalProblem(problem, (), False), outcome, states[:size].T)[0]
     arrays = [leaf for leaf in jax.tree.leaves(modules) if eqx.is_array(leaf) and leaf.ndim > 0]
     in_lanes = all(arrays_in_lanes and eqx.is_inexact_array(leaf) for leaf in arrays)
     kind = BlockSampling if in_lanes and isinstance(settings.for_lanes, diffrax.AbstractERK) else SingleSampling
-    samples = solve_for_samples(kind, build, modules, jax.lax.stop_gradient(times), t1, settings, grid)
+    samples = solve_for_samples(kind, build, modules, times, t1, settings, grid)
     # Separate calls: all arguments of a custom derivative count as used.
     states = _at_times(samples.states, None, times, modules, build)
-    quadratures = (
-        None if samples.quadratures is None else _at_times(samples.quadratures, samples.states, times, modules, build)
-    )
-    return samples._replace(states=states, quadratures=quadratures)
+    if samples.quadratures is None:
+        return samples._replace(states=states)
+    return samples._replace(states=states, quadratures=_at_times(samples.quadratures, states, times, modules, build))
 
 
 @eqx.filter_custom_jvp
@@ -262,13 +262,24 @@ def _at_times(
 def _later(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
     (samples, leading, times, modules, build), (sample_rates, _, time_rates, *_) = primals, tangents
     sample_rates = jnp.zeros_like(samples) if sample_rates is None else sample_rates
+    # Second derivatives need samples that move with the times.
+    samples = _at_times(samples, leading, times, modules, build)
     if time_rates is None:
         return samples, sample_rates
-    problem, size = build(modules, None), samples.shape[-1]
+    problem = build(modules, None)
     full_problem = core_problem(problem) if leading is None else problem
     states = samples if leading is None else jnp.concatenate([leading, samples], axis=-1)
-    rates = jax.vmap(full_problem.field)(times, states)[:, -size:]
+    rates = jax.vmap(full_problem.field)(times, states)[:, -samples.shape[-1] :]
     return samples, sample_rates + jnp.where(jnp.isfinite(rates), rates * time_rates[:, None], 0.0)
+
+
+def with_later_changes(
+    variational: VariationalProblem, times: Float[Array, " times"], samples: Float[Array, "*cells times components"]
+) -> Float[Array, "*cells times components"]:
+    """The samples, with derivatives of their variations with respect to the times, for second derivatives."""
+    passed, size = times - jax.lax.stop_gradient(times), samples.shape[-1] // (1 + len(variational.tangents))
+    rates = jax.vmap(lambda time, state: variational.field(time, state.T).T, (0, -2), -2)(times, samples)[..., size:]
+    return samples.at[..., size:].add(jnp.where(jnp.isfinite(rates), rates, 0.0) * passed[:, None])
 
 
 def core_problem(problem: AbstractProblem) -> AbstractProblem:
@@ -302,8 +313,9 @@ class BlockSampling(AbstractSampling):
     def sampled(self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool) -> Sampled:
         variational, (times, t1, settings, _) = VariationalProblem(built, tangents, False), options
         arguments = (variational, times, t1, jnp.asarray(built.start()[0].shape[1]), settings)
-        samples = solve_with_samples(*arguments, n_blocks=1 + len(tangents), one_kernel=not nested)
-        return _with_slopes(variational, *samples)
+        outcome, samples = solve_with_samples(*arguments, n_blocks=1 + len(tangents), one_kernel=not nested)
+        samples = with_later_changes(variational, times, samples) if nested else samples
+        return _with_slopes(variational, outcome, samples)
 
     def pull_back(self, active: tuple[int, ...], cells: int, leaves: Leaves, cotangents: SampledRun) -> Gradient:
         solve = dataclasses.replace(self, core_only=True) if cotangents.quadratures is None else self
@@ -360,8 +372,9 @@ class SingleSampling(AbstractSampling):
 
     def sampled(self, built: AbstractProblem, tangents: Tangents, options: Options, nested: bool) -> Sampled:
         variational, (times, t1, settings, grid) = VariationalProblem(built, tangents, False), options
-        outcome, states = sample(variational, times, t1, settings, grid=grid)
-        samples, slopes = _with_slopes(variational, outcome, states.T)
+        outcome, states = sample(variational, jax.lax.stop_gradient(times), t1, settings, grid=grid)
+        states = with_later_changes(variational, times, states.T) if nested else states.T
+        samples, slopes = _with_slopes(variational, outcome, states)
 
         def jump_times(problem: AbstractProblem) -> Array | None:
             jumps = problem.jumps(jnp.zeros_like(t1), problem.start()[0])

@@ -316,6 +316,30 @@ def test_a_lagrangian_of_one_s_own_is_run_by_poincare_s_equations():
     assert isinstance(formulation_of(Routhian(system, cyclic=0, momentum=0.3)), Hamel)
 
 
+class Fading(AbstractMode):
+    rate: float
+
+    def field(self, t, y):
+        return -self.rate * t * y
+
+
+def test_derivatives_by_the_times_of_samples_and_the_horizon():
+    """y = exp(-rate t^2 / 2): all second derivatives; the horizon moves the end alone."""
+
+    def last(point, t1=3.0):
+        run = simulate(Hybrid([Fading(point[0])]), [1.0], t1, times=point[1:])
+        return jnp.sin(run.state[0, 0]), run.end_time
+
+    def exact(point):
+        return jnp.sin(jnp.exp(-0.5 * point[0] * point[1] ** 2))
+
+    point = jnp.array([0.7, 1.3])
+    hessian, of_end = jax.jit(jax.hessian(last))(point)
+    assert_close(hessian, jax.hessian(exact)(point), rtol=1e-7)
+    assert_close(of_end, 0.0)
+    assert_close(jnp.stack(jax.jacrev(last, 1)(point, 3.0)), [0.0, 1.0])
+
+
 def test_derivatives_that_do_not_exist_through_resets_are_refused_in_words():
     """Derivatives with respect to the horizon, and second derivatives: messages do not mention another model."""
     ball, start = Hybrid([Ball()]), jnp.array([1.0, 0.0, 0.0])
