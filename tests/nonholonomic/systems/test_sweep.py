@@ -101,6 +101,9 @@ def test_one_number_of_all_modes_is_named_once():
         sweep(block, [0.0, 0.5], 1.0, axes={"belt": [0.5]})
     with pytest.raises(ValueError, match=r"'system.modes\[1\].belt' is named twice, alone and for all modes"):
         sweep(block, [0.0, 0.5], 1.0, axes={"modes[*].belt": [0.5], "modes[1].belt": [0.5]})
+    apart = Hybrid([Stick(belt=0.5), Slip(belt=0.6)], event=Middle())
+    with pytest.raises(ValueError, match=r"'system.modes\[\*\].belt' stands for several numbers, which differ"):
+        sweep(apart, [0.0, 0.5], 1.0, axes={"start[0]": [0.0]}, sensitivities=["modes[*].belt"])
 
 
 def test_a_mechanical_system_has_a_table_over_its_start_and_numbers():
