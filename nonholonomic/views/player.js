@@ -49,8 +49,9 @@ window.views = window.views || {};
       Object.assign(this, { facts, root, listeners: [], now: 0, running: false, before: null, turn: false, filming: false });
       const { element } = views, boxes = element("div", root, { id: "stages" });
       // The legend of the curves tells runs of equal names on several stages apart.
-      const names = stages.flatMap((fact) => fact.shows.map((run) => run.name)), once = (name) => names.indexOf(name) === names.lastIndexOf(name);
+      const runs = stages.flatMap((fact) => fact.shows), names = runs.map((run) => run.name), once = (name) => names.indexOf(name) === names.lastIndexOf(name);
       for (const { title, shows } of stages) for (const run of shows) run.legend = once(run.name) ? run.name : `${title}, ${run.name}`;
+      runs.forEach((run, k) => { run.dashes = views.dashesOf(runs, k); });
       this.stages = stages.map((fact) => this.figure(element("figure", boxes), fact, THREE));
       this.bar(element("div", root, { id: "controls" }));
       const strips = element("div", root, { id: "strips" });
@@ -84,11 +85,11 @@ window.views = window.views || {};
       if (fact.title && fact.title !== document.title) element("b", caption, { textContent: fact.title });
       const notes = new Set(fact.shows.map((run) => run.note).filter(Boolean));
       for (const note of notes) element("span", caption, { className: "warning", textContent: note });
-      const names = fact.shows.length > 1 ? fact.shows.map((run) => [run.name, run.colour]) : [];
-      for (const [words, colour] of [...(fact.arena.spacing ? [[fact.arena.spacing]] : []), ...names]) {
+      if (fact.arena.spacing) element("span", caption, { className: "key", textContent: fact.arena.spacing });
+      for (const run of fact.shows.length > 1 ? fact.shows : []) {
         const key = element("span", caption, { className: "key" });
-        if (colour) element("i", key).style.background = colour;
-        key.append(words);
+        views.sample(key, run);
+        key.append(run.name);
       }
       const chip = (kind, { name, colour, shown }, k) => {
         const one = element("button", caption, { className: "chip", type: "button", title: "show or hide" });

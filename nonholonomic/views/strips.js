@@ -23,20 +23,43 @@ window.views = window.views || {};
     return Number.isFinite(v) ? v : part < 0.5 ? before : after;
   }
 
-  //: Room left of a curve for its numbers, and below it; the sizes of the texts in pixels.
-  const LEFT = 66, FOOT = 5, TEXT = 13;
+  //: Room left of a curve for its numbers, and below it for those of the time; the length of a tick; the sizes of the texts in pixels.
+  const LEFT = 66, FOOT = 24, TICK = 4, TEXT = 13;
+  //: Least distance of the numbers of the time in pixels.
+  const APART = 64;
 
-  // The numbers at an axis: round ones, at least two; and its ends, moved to such a number if one is near.
-  function ticked(low, high, isAngle) {
-    const least = (high - low) / 4, power = 10 ** Math.floor(Math.log10(least));
+  // The least round step that is not below `least`.
+  function rounded(least, isAngle) {
+    const power = 10 ** Math.floor(Math.log10(least));
     const steps = isAngle && least > 10 && least <= 180 ? [15, 30, 45, 90, 180] : [1, 2, 5, 10].map((one) => one * power);
-    const step = steps.find((one) => one >= 0.999 * least);
-    const [first, last] = [Math.floor, Math.ceil].map((round, k) => step * round([low, high][k] / step));
-    [low, high] = [low - first < least ? first : low, last - high < least ? last : high];
+    return steps.find((one) => one >= 0.999 * least);
+  }
+  // The numbers at the multiples of a step, and their texts.
+  function numbered(low, high, step) {
     const begin = Math.ceil(low / step - 1e-6), count = Math.floor(high / step + 1e-6) - begin + 1, most = Math.max(Math.abs(low), Math.abs(high));
     const text = (v) => v === 0 ? "0" : most < 1e-3 || most >= 1e5 ? Number(v.toPrecision(6)).toExponential()
       : v.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
-    return { low, high, ticks: Array.from({ length: count }, (_, k) => step * (begin + k)).map((v) => [v, text(v)]) };
+    return Array.from({ length: count }, (_, k) => step * (begin + k)).map((v) => [v, text(v)]);
+  }
+  // The numbers at an axis: round ones, at least two; and its ends, moved to such a number if one is near.
+  function ticked(low, high, isAngle) {
+    const least = (high - low) / 4, step = rounded(least, isAngle);
+    const [first, last] = [Math.floor, Math.ceil].map((round, k) => step * round([low, high][k] / step));
+    [low, high] = [low - first < least ? first : low, last - high < least ? last : high];
+    return { low, high, ticks: numbered(low, high, step) };
+  }
+
+  //: Dashes and gaps in pixels of the curves of runs whose colour is also that of an earlier run.
+  const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3]];
+  // The run's dashes: none for the first run of a colour.
+  function dashesOf(runs, number) {
+    return DASHES[runs.slice(0, number).filter(({ colour }) => colour === runs[number].colour).length % DASHES.length];
+  }
+  // A piece of the curve of a run, for legends.
+  function sample(parent, { colour, dashes }) {
+    const end = { width: 30, height: 4 }, canvas = views.element("canvas", parent, { className: "sample", ...end }), pen = canvas.getContext("2d");
+    Object.assign(pen, { strokeStyle: colour, lineWidth: 4 });
+    pen.setLineDash(dashes ?? []); pen.beginPath(); pen.moveTo(0, 2); pen.lineTo(30, 2); pen.stroke();
   }
 
   const labelOf = ({ name, unit }) => (unit ? `${name} [${unit}]` : name);
@@ -47,7 +70,12 @@ window.views = window.views || {};
       Object.assign(this, { runs, seek, now: 0, pointed: null });
       if (runs().length > 1) {
         const legend = views.element("div", parent, { className: "names" });
-        for (const run of runs()) views.element("span", legend, { textContent: run.legend ?? run.name }).style.color = run.colour;
+        for (const run of runs()) {
+          const name = views.element("span", legend);
+          name.style.color = run.colour;
+          sample(name, run);
+          name.append(run.legend ?? run.name);
+        }
       }
       const curves = runs().flatMap((run) => run.curves), labels = [...new Set(curves.map(labelOf))];
       // The curves that check a run are folded away below the others.
@@ -87,7 +115,7 @@ window.views = window.views || {};
       for (const strip of this.strips) {
         strip.curves = runs.flatMap((run) => run.curves.filter((curve) => labelOf(curve) === strip.label)
           .map((curve) => ({
-            times: run.times, colour: run.colour, marks: run.marks, values: curve.factor === 1 ? curve.values : curve.values.map((v) => curve.factor * v),
+            times: run.times, colour: run.colour, dashes: run.dashes ?? [], marks: run.marks, values: curve.factor === 1 ? curve.values : curve.values.map((v) => curve.factor * v),
           })));
         let low = Infinity, high = -Infinity;
         for (const curve of strip.curves) for (const v of curve.values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
@@ -95,8 +123,8 @@ window.views = window.views || {};
         const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high)) || 1;
         if (!(high - low > least)) { low -= least; high += least; }
         // What is no pixel away from 0 is 0, such as the round-off of a body at the ground.
-        const rounded = (end) => Math.abs(end) < 1e-3 * (high - low) ? 0 : end;
-        Object.assign(strip, ticked(rounded(low), rounded(high), strip.label.endsWith("[deg]")), { ahead: null });
+        const settled = (end) => Math.abs(end) < 1e-3 * (high - low) ? 0 : end;
+        Object.assign(strip, ticked(settled(low), settled(high), strip.label.endsWith("[deg]")), { ahead: null });
         strip.told?.replaceChildren(...strip.curves.flatMap(({ colour, marks }) => marks.map(([, textContent]) => {
           const words = Object.assign(document.createElement("span"), { textContent });
           words.style.color = colour;
@@ -104,6 +132,8 @@ window.views = window.views || {};
         })));
       }
     }
+    // The numbers of the time below a curve of a width in pixels.
+    times(width) { return numbered(0, this.duration, rounded(this.duration / Math.min(10, Math.max(2, width / APART)))); }
     paint(strip) {
       const { canvas } = strip, ratio = window.devicePixelRatio || 1;
       const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
@@ -115,7 +145,7 @@ window.views = window.views || {};
         const layer = Object.assign(document.createElement("canvas"), { width, height }), pen = layer.getContext("2d");
         Object.assign(pen, { lineWidth: thick * ratio, lineJoin: "round" });
         for (const curve of strip.curves) {
-          pen.strokeStyle = curve.colour; pen.beginPath();
+          pen.strokeStyle = curve.colour; pen.setLineDash(curve.dashes.map((length) => length * ratio)); pen.beginPath();
           let down = false;
           curve.values.forEach((v, k) => {
             if (!Number.isFinite(v)) { down = false; return; }
@@ -126,7 +156,7 @@ window.views = window.views || {};
         }
         return layer;
       };
-      Object.assign(strip, { x, y, x0, x1, y0, y1, ratio, ahead: drawn(0.8), passed: drawn(2.2) });
+      Object.assign(strip, { x, y, x0, x1, y0, y1, ratio, times: this.times(canvas.clientWidth - LEFT), ahead: drawn(1.5), passed: drawn(2.8) });
     }
     draw(time) {
       this.now = time;
@@ -144,6 +174,15 @@ window.views = window.views || {};
         pen.beginPath(); pen.moveTo(x0, at); pen.lineTo(x1, at); pen.stroke();
         pen.fillText(text, x0 - 6 * ratio, Math.min(Math.max(at, half), canvas.height - half));
       }
+      const below = y0 + (TICK + 4 + 0.5 * TEXT) * ratio;
+      pen.fillText("time [s]", x0 - 10 * ratio, below);
+      pen.strokeStyle = "#6b7280"; pen.textAlign = "center"; pen.beginPath();
+      for (const [tick, text] of strip.times) {
+        const at = strip.x(tick), half = 0.5 * pen.measureText(text).width;
+        pen.moveTo(at, y0); pen.lineTo(at, y0 + TICK * ratio);
+        pen.fillText(text, Math.min(at, canvas.width - half), below);
+      }
+      pen.stroke();
       pen.drawImage(strip.ahead, 0, 0);
       pen.save(); pen.beginPath(); pen.rect(0, 0, now, canvas.height); pen.clip(); pen.drawImage(strip.passed, 0, 0); pen.restore();
       const upright = (at, dashes, colour = "#23262b") => {
@@ -167,5 +206,5 @@ window.views = window.views || {};
     }
   }
 
-  Object.assign(window.views, { Strips, place, digits });
+  Object.assign(window.views, { Strips, place, digits, dashesOf, sample });
 })();

@@ -249,6 +249,47 @@ def test_the_numbers_at_a_curve_are_round(browser, unit, values, ends, ticks):
     assert texts == ticks
 
 
+def test_every_curve_has_an_axis_of_time(browser):
+    """Round numbers and their unit, below the plot and inside the canvas; more of them where there is room."""
+    told = browser.execute_script(
+        "const told = []; const { fillText } = CanvasRenderingContext2D.prototype;"
+        "CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {"
+        " told.push([this.canvas, text, y]); fillText.call(this, text, x, y); };"
+        "player.seek(0.3); CanvasRenderingContext2D.prototype.fillText = fillText;"
+        "return [...document.querySelectorAll('.strip canvas')].filter((one) => one.checkVisibility()).map((canvas) =>"
+        " told.filter(([owner]) => owner === canvas).map(([, text, y]) => [text, canvas.height - y]))"
+    )
+    for texts in told:
+        heights = [height for text, height in texts if text == "time [s]"]
+        assert len(heights) == 1
+        assert 5.0 < heights[0] < 15.0
+        assert [text for text, height in texts if height == heights[0]][1:] == ["0", "0.2", "0.4", "0.6", "0.8", "1.0"]
+    numbers = "return [130, 400].map((width) => views.Strips.prototype.times.call({ duration: 8.1 }, width).map(([at]) => at))"
+    assert browser.execute_script(numbers) == [[0, 5], [0, 2, 4, 6, 8]]
+
+
+def test_runs_of_one_colour_have_other_dashes(browser):
+    """In the legend and in the curves: a flat curve is all of its colour, or has gaps."""
+    dashes, counts = browser.execute_script(
+        "const runs = ['red', 'blue', 'red', 'red'].map((colour, k) => ({ times: [0, 1], name: `run ${k}`, colour, marks: [],"
+        " curves: [{ name: 'a', unit: 'm', factor: 1, values: [k, k] }] }));"
+        "runs.forEach((run, k) => { run.dashes = views.dashesOf(runs, k); });"
+        "const box = document.createElement('div'); document.body.append(box);"
+        "const made = new views.Strips(box, () => runs, () => 0), [strip] = made.strips; made.draw(0);"
+        "const { passed, x0, x1 } = strip;"
+        "const count = (canvas, y, x, width) => canvas.getContext('2d').getImageData(x, y, width, 1).data"
+        ".filter((_, k) => k % 4 === 3).reduce((sum, alpha) => sum + (alpha > 128), 0) / width;"
+        "const legend = [...box.querySelectorAll('.sample')].map((one) => count(one, 2, 0, one.width));"
+        "const curves = runs.map((_, k) => count(passed, Math.floor(strip.y(k)), Math.ceil(x0), Math.floor(x1 - x0)));"
+        "box.remove(); return [runs.map((run) => run.dashes), [legend, curves]]"
+    )
+    assert dashes[:2] == [[], []]
+    assert len({tuple(one) for one in dashes[1:]}) == 3
+    for parts in counts:
+        assert parts[:2] == [1.0, 1.0]
+        assert all(0.3 < part < 0.8 for part in parts[2:])
+
+
 def test_tables_fit_on_a_phone(browser):
     rows = [["theta(0)", *(f"mu = {0.1 * k:.1f}" for k in range(1, 6))], ["18 deg", *["not in time"] * 5]]
     widths = browser.execute_script(
