@@ -127,7 +127,7 @@ UNITS = {
 #: Other names of units.
 SYNONYMS = {"°": "deg", "degree": "deg", "degrees": "deg", "°/s": "deg/s", "radian": "rad", "radians": "rad"}
 SYNONYMS |= {"sec": "s", "second": "s", "seconds": "s", "1/min": "rpm", "rev/min": "rpm", "U/min": "rpm"}
-SYNONYMS |= {"turn": "rev", "turns": "rev", "turns/s": "rev/s", "degrees/s": "deg/s"}
+SYNONYMS |= {"turn": "rev", "turns": "rev", "turns/s": "rev/s", "rps": "rev/s", "degrees/s": "deg/s", "Grad": "deg"}
 
 #: The unit of drawn numbers, such as "deg", or several for numbers of different dimensions; `None` for SI units.
 Unit: TypeAlias = str | Sequence[str] | None

@@ -71,9 +71,8 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...], vector: bool 
         )
     if isinstance(value, eqx.Module):
         # If the parameters have one number per lane, so have the results.
-        of_one_run = not vector and results[0].shape == ()
-        of_one_run = of_one_run and (len(shapes) > 1 or not _takes_lanes(value, len(arguments)))
-        return Held(parted(value)) if of_one_run and not isinstance(value, Held) else value
+        of_lanes = vector or results[0].shape or (len(shapes) == 1 and _takes_lanes(value, len(arguments)))
+        return value if of_lanes or isinstance(value, Held) else Held(parted(value))
     if any(is_traced(constant) for constant in program.consts):
         function = with_own_numbers(value, *at)
         return function if vector else Held(parted(function))

@@ -24,6 +24,9 @@ POOR = 0.01
 #: A measurement with a larger residual cannot be explained.
 FAR = 4.0
 
+#: A measurement farther than so many errors is an outlier, if at most this share of all are. So many are named.
+OUTLYING, MOST_OUTLYING, MOST_NAMED = 5.0, 0.05, 3
+
 #: Residuals that are all smaller than this are not noise but round-off and integration errors, which may keep their
 #: sign.
 NEGLIGIBLE = 1e-3
@@ -47,8 +50,8 @@ class Verdict(NamedTuple):
     - `agree`, `starts`: number of refined candidates that reached the best minimum, and number of all.
     - `undetermined`: the parameters that the data do not determine, in words.
     - `concerns`: the concerns, in words; empty for a flawless fit.
-    - `notes`: what is special about the likelihood, in words; errors and intervals take account of it. If `p_value` is NaN, the
-      first one says why.
+    - `caveats`: what the fit takes for granted, in words, and why `p_value` is NaN.
+    - `notes`: what is special about the likelihood, in words; errors and intervals take account of it.
     - `effective`, `k`: effective number of draws behind errors and intervals, and the shape of the tail of their weights
       (Pareto k-hat): below 0.7, they can be trusted.
     - `minima`: the minima that the data allow, as `Minimum`, the most probable first.
@@ -60,6 +63,7 @@ class Verdict(NamedTuple):
     starts: int
     undetermined: tuple[str, ...]
     concerns: tuple[str, ...]
+    caveats: tuple[str, ...]
     notes: tuple[str, ...]
     effective: float
     k: float
@@ -73,21 +77,25 @@ class Verdict(NamedTuple):
     def __str__(self) -> str:
         """Whether to believe the fit, and what to do; `Identification.details` has the statistics."""
         if self.concerns:
-            return "\n  ".join(["do not rely on this fit yet:", *self.concerns])
-        if math.isnan(self.p_value):
-            return f"no concerns, but {self.notes[0]}"
-        return "no concerns about this fit" + (
-            f", {counted(len(self.notes), 'note')} in its details" if self.notes else ""
-        )
+            return "\n  ".join(["do not rely on this fit yet:", *self.concerns, *self.caveats])
+        if self.caveats:
+            return f"no concerns, but {'; '.join(self.caveats)}"
+        return "no concerns about this fit" + bool(self.notes) * f", {counted(len(self.notes), 'note')} in its details"
 
 
 def judge(
-    ends: Minima, explorer: Explorer, sample: Pool, distribution: "Distribution", unseen: tuple[str, ...], status: str
+    labels: tuple[str, ...],
+    ends: Minima,
+    explorer: Explorer,
+    sample: Pool,
+    distribution: "Distribution",
+    unseen: tuple[str, ...],
+    status: str,
 ) -> Verdict:
     """Judge a fit.
 
-    **Arguments:** `ends`: those of the search; `distribution`: that of the coordinates; `unseen`: the combinations that the
-    data do not determine; `status`: that of the fit.
+    **Arguments:** `labels`: the names of the measurements; `ends`: those of the search; `distribution`: that of the
+    coordinates; `unseen`: the combinations that the data do not determine; `status`: that of the fit.
 
     **Returns:** a `Verdict`.
     """
@@ -101,7 +109,8 @@ def judge(
     degrees = len(residual) - len(by_slopes) - int(np.sum(~exact))
     scores = normal_scores(measurements, prediction)
     chi_squared, p_value = float(np.sum(scores[exact] ** 2)), math.nan
-    if degrees > 0 and not np.any(measurements.estimated):
+    is_estimated = bool(np.any(measurements.estimated))
+    if degrees > 0 and not is_estimated:
         p_value = float(chdtrc(degrees, chi_squared)) if math.isfinite(chi_squared) else 0.0
     parts = [scores[exact & (measurements.series == number)] for number in np.unique(measurements.series)]
     orders = [runs_of_signs(part) for part in parts]
@@ -111,11 +120,9 @@ def judge(
     is_outside = np.abs(distribution.estimate - region.middle) > region.half_width
     outside = ", ".join(np.array(explorer.density.problem.names)[is_outside])
     fixed = " and ".join(getattr(explorer.density.problem.model, "fixed", ()))
-    untested = "no measurement is left to test this fit"
-    if np.any(measurements.estimated):
-        untested = "nothing tests this fit, as its errors come from its own residuals: pass `error`"
-    untested += f"; held fixed as if exact: {fixed}" if fixed else ""
-    fixed = f", and {fixed}, which were held fixed" if fixed else ""
+    far = [f"{labels[k]} ({abs(scores[k]):.0f} errors)" for k in np.flatnonzero(np.abs(scores) > OUTLYING)]
+    # A wrong model, or too small an error, puts many measurements far away.
+    outlying = ", ".join(far[:MOST_NAMED]) if len(far) <= MOST_OUTLYING * len(scores) else ""
     impossible, share = without_prediction(explorer, sample, distribution)
     minima, concerns, notes = (), (), ()
     if distribution.kind == "weights":
@@ -135,8 +142,9 @@ def judge(
             (len(minima) > 1, f"the data allow {len(minima)} minima, which the details list: state a prior or bounds"),
             (
                 p_value < POOR,
-                f"the residuals are too large for the intervals to be valid: check the model and the errors{fixed}",
+                "the residuals are too large for the intervals to be valid: check the model and the errors",
             ),
+            (outlying, f"far from the fit: {outlying}: leave mistakes out, or pass student=4"),
             (violated, f"{violated} limits are violated by more than {FAR:.0f} errors"),
             (
                 p_trend < POOR,
@@ -151,7 +159,6 @@ def judge(
     )
     notes = (
         *sentences(
-            (math.isnan(p_value), untested),
             (
                 outside,
                 f"{outside}: outside of the range in which minima were searched, so better ones may be missing; start closer, "
@@ -169,6 +176,11 @@ def judge(
         starts=len(ends.starts),
         undetermined=unseen,
         concerns=concerns,
+        caveats=sentences(
+            (is_estimated, "nothing tests this fit, as its errors come from its own residuals: pass `error`"),
+            (degrees <= 0 and not is_estimated, "no measurement is left to test this fit"),
+            (fixed, f"held fixed as if exact: {fixed}; if these were measured, free them with priors"),
+        ),
         notes=notes,
         effective=sample.effective,
         k=sample.k,
@@ -179,8 +191,7 @@ def judge(
 def _undetermined(words: str) -> str:
     """The concern about a combination of parameters, which is given in words such as "mass +1 %, length -1 %"."""
     names = [re.split(r" [+-]", part)[0] for part in words.split(", ")]
-    remedy = "fix one of them" if len(names) > 1 else "fix it"
-    return f"the data do not determine {' and '.join(names)}: {remedy}, or give a prior"
+    return f"the data do not determine {' and '.join(names)}: fix {'one' if len(names) > 1 else 'it'}, or give a prior"
 
 
 def sentences(*table: tuple[object, str]) -> tuple[str, ...]:
@@ -507,7 +518,8 @@ def remarks(
         for bound in (problem.unknowns.lower[k], problem.unknowns.upper[k]):
             if np.isfinite(bound) and np.sum(weights[np.abs(values[:, k] - bound) < NEAR * (high - low)]) > CUT:
                 concerns.append(
-                    f"the bound {explorer.density.written(name, float(bound))} cuts the interval of {name}: widen it"
+                    f"the bound {explorer.density.written(name, float(bound))} cuts the interval of {name}: if it is "
+                    "yours, widen it; if less is impossible, fix another number, or state a prior"
                 )
         low, high = distribution.interval(k, 1.96)
         sides = high - distribution.estimate[k], distribution.estimate[k] - low

@@ -458,8 +458,8 @@ class TextTable(NamedTuple):
         if of_header is not None and SYNONYMS.get(of_header, of_header) != plain:
             raise ValueError(
                 f"{argument}: {name!r} = {shown(column)} contradicts the header {first!r}, whose unit is {of_header}, "
-                f"not {unit}: pass the header alone, {name!r}: {first!r}; if the header is wrong, correct it or pass a "
-                f"factor, the number of {si} in {unit}"
+                f"not {unit}: pass the header alone, {name!r}: {first!r}; if the header is wrong, correct it or pass "
+                f"({first!r}, {factors[plain]:.9g}), with the number of {si} in a {plain}"
             )
         return first, factors[plain]
 

@@ -45,8 +45,8 @@ MOST_ROWS = 24
 
 
 class ResidualRow(NamedTuple):
-    """One measurement: its value, its error, the prediction of the fit, the residual in units of the error, and the
-    upper limit (the value itself for a measured value, infinite for a lower limit)."""
+    """One measurement: its value, its error, the prediction of the fit, the residual (value - prediction) in units of the
+    error, and the upper limit (the value itself for a measured value, infinite for a lower limit)."""
 
     label: str
     value: float
@@ -286,15 +286,14 @@ class Identification:
         """The statistics behind the verdict, estimates with standard errors, the combinations of parameters that the data
         determine, and the residuals."""
         verdict, p_value, count = self.verdict, self.verdict.p_value, self.verdict.starts
-        errors = "no errors" if np.isnan([*self.standard_errors.values()]).all() else "errors"
         lines = [
             f"-2 log likelihood {self.deviance:.4g} at the most likely values, {self.degrees} degrees of freedom",
             *([] if math.isnan(p_value) else [f"residuals this large have a probability of {p_value:.2g}"]),
             *(f"{order.runs} runs of {order.count} signs (p = {order.p_value:.2g})" for order in verdict.series),
             f"{verdict.agree} of {count} refined candidates ended at the best minimum"
             + (", the others fit worse or were stopped early" if verdict.agree < count else ""),
-            f"{errors} from {verdict.effective:.0f} effective draws (k-hat {verdict.k:.2f})",
-            *(f"note: {note}" for note in verdict.notes),
+            f"{verdict.effective:.0f} effective draws (k-hat {verdict.k:.2f})",
+            *(f"note: {note}" for note in (*verdict.caveats, *verdict.notes)),
             "estimates, standard errors, most likely values",
         ]
         width = max(map(len, self.estimates))
@@ -307,7 +306,7 @@ class Identification:
         for value, words in zip(self.identifiability.singular_values, self.identifiability.words, strict=True):
             mark = "  UNDETERMINED" if words in self.identifiability.unseen else ""
             lines.append(f"  {1.0 / max(value, 1e-300):8.2g}  {words}{mark}")
-        lines.append("measured, predicted at the most likely values, residual in standard errors")
+        lines.append("measured, predicted at the most likely values, measured - predicted in standard errors")
         width = max(len(row.label) for row in self.residuals)
         for row, unit, _ in self.rows_in()[:MOST_ROWS]:
             predicted = f"{row.prediction:.6g} {readable_unit(unit)}".rstrip()
@@ -336,7 +335,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         slope_errors = np.sqrt(np.diag(by_slopes) * slopes**2)
     distribution = Distribution.of(optimum, by_slopes, sample)
     likely, covariance = problem.unknowns.values(optimum), distribution.covariance_of_values(problem, slopes)
-    numbers = (measurements.value, measurements.error, linearised.prediction[best], linearised.residual[best, :count])
+    numbers = (measurements.value, measurements.error, linearised.prediction[best], -linearised.residual[best, :count])
     table = zip(labels, *(np.asarray(part).tolist() for part in (*numbers, measurements.upper)), strict=True)
     combinations = identifiability(ends.density, likely, slopes, linearised.information[best, :count])
     # Where the weights hold, a search by slopes that got stuck on a stair, or ended early, does not matter.
@@ -360,7 +359,7 @@ def summarise(labels: tuple[str, ...], ends: Minima, explorer: Explorer, sample:
         ends=by_name(problem.unknowns.values(ends.coordinates).T),
         end_deviances=deviances,
         statuses=statuses,
-        verdict=judge(ends, explorer, sample, distribution, combinations.unseen, status),
+        verdict=judge(labels, ends, explorer, sample, distribution, combinations.unseen, status),
         coordinates=distribution.estimate,
         coordinate_covariance=distribution.covariance,
         distribution=distribution,

@@ -167,8 +167,8 @@ def test_what_changes_and_what_stays(name):
     s, bend, momentum_rate = (np.asarray(part) for part in (quantities.place, rate.velocity, rate.momentum[2]))
     size = 0.02 * np.max(np.abs(s)) * (9.81 + np.max(np.abs(bend)))
     orbital = 0.02 * (s[0] * bend[1] - s[1] * bend[0])
-    mode_segments = np.max(np.abs(orbital + momentum_rate)[~rubs]) < 1e-12 * size
-    assert mode_segments == (name not in NOT_OF_REVOLUTION)
+    is_conserved = np.max(np.abs(orbital + momentum_rate)[~rubs]) < 1e-12 * size
+    assert is_conserved == (name not in NOT_OF_REVOLUTION)
     assert_close(momentum_rate[balls], 0.0, atol=1e-12 * size)
 
 

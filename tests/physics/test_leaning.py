@@ -153,15 +153,15 @@ def test_the_end_of_rocking():
     free, impulses = FreeBody.of(scene.body, spheres[0], jnp.asarray(states)), []
     for striking in (0, 1):
         # The top turns about the sphere that stays.
-        mode_segments, other_sphere = spheres[1 - striking], spheres[striking]
-        rate = -1e-6 / (other_sphere.offset - mode_segments.offset)
+        resting_sphere, other_sphere = spheres[1 - striking], spheres[striking]
+        rate = -1e-6 / (other_sphere.offset - resting_sphere.offset)
         horizontal = np.stack([-states[3], states[2]]) / math.sin(first_contact(scene.body))
         sine2 = states[2] ** 2 + states[3] ** 2
         tilt = rate * 8e-7 / np.sqrt(sine2)
         momentum = (*(L - tilt * a for L, a in zip(free.momentum[:2], horizontal, strict=True)), free.momentum[2])
-        free_before = FreeBody((*free.velocity[:2], -mode_segments.offset * rate), free.height, free.axis, momentum)
+        free_before = FreeBody((*free.velocity[:2], -resting_sphere.offset * rate), free.height, free.axis, momentum)
         assert_close(free_before.gap_rate(scene.body, other_sphere), -1e-6, rtol=1e-9)
-        assert_close(free_before.gap_rate(scene.body, mode_segments), 0.0, atol=1e-15)
+        assert_close(free_before.gap_rate(scene.body, resting_sphere), 0.0, atol=1e-15)
         free_after, takes = LeaningDynamics.of(scene).stopped(free_before)
         assert_close([free_after.gap_rate(scene.body, ball) for ball in spheres], 0.0, atol=1e-15)
         energy_change = free_after.energy(scene.body, 9.81) - free_before.energy(scene.body, 9.81)

@@ -78,6 +78,9 @@ def test_friction_from_a_film(rutstam_scene, tmp_path):
     measured = f" {math.degrees(first.value):.6g} +- {math.degrees(NOISE):.2g}"
     row = f"{measured:20}  {math.degrees(first.prediction):.6g} deg  {first.residual:+.2f}"
     assert row in fit.details
+    assert_close(first.residual, (first.value - first.prediction) / NOISE)
+    # A launch that was measured is not exact.
+    assert "no concerns, but held fixed as if exact: launch.theta and launch.spin; if these" in str(fit)
     panel = fit.plot().axes[0]
     assert panel.get_ylabel() == "theta [deg]"
     assert_close(panel.containers[0].lines[0].get_ydata(), [math.degrees(row.value) for row in fit.residuals])

@@ -158,6 +158,20 @@ def test_as_many_unknowns_as_measurements_leave_nothing_to_judge_by():
     assert "verdict: no concerns, but no measurement is left to test this fit\n" in str(fit)
 
 
+def test_a_measurement_far_from_the_fit_is_named_whether_errors_are_known_or_not():
+    value = 2.0 + 0.1 * np.cos(np.arange(40.0) ** 2)
+    value[7] += 5.0
+    for estimated in (False, True):
+        measurements = Measurements(value, 0.1, estimated=np.full(40, estimated))
+        with pytest.warns(
+            FitWarning, match=r"far from the fit: #8 \(\d+ errors\): leave mistakes out, or pass student=4"
+        ):
+            fit = identify(lambda p: p["x"][:, None] * np.ones(40), measurements, {"x": 0.5})
+        assert not fit.verdict.good
+    fit = identify(lambda p: p["x"][:, None] * np.ones(40), Measurements(value, 0.1, student=4.0), {"x": 0.5})
+    assert "far from the fit" not in str(fit)
+
+
 def test_scores_of_student_errors_are_normal():
     z = np.linspace(-8.0, 8.0, 9)
     scores = normal_scores(Measurements(np.zeros(9), 1.0, student=4.0), z)
@@ -211,9 +225,6 @@ def test_a_report_states_values_with_intervals_and_what_to_do_before_any_statist
     noted = dataclasses.replace(fit, verdict=fit.verdict._replace(notes=("a staircase",)))
     assert "verdict: no concerns about this fit, 1 note in its details" in str(noted)
     assert "note: a staircase" in noted.details
-    assert "\nerrors from " in fit.details
-    unknown = dataclasses.replace(fit, standard_errors=dict.fromkeys(fit.standard_errors, math.nan))
-    assert "\nno errors from " in unknown.details
     moved = fit.estimates["rate"] + 0.5 * fit.standard_errors["rate"]
     apart = dataclasses.replace(fit, most_likely={**fit.most_likely, "rate": moved})
     assert f"; most likely {moved:.4g})" in str(apart)
