@@ -233,7 +233,7 @@ def computed(options: argparse.Namespace) -> dict[str, bytes]:
             ):
                 figure.savefig(options.out / name, dpi=110)
                 files.append(name)
-                pictures.append(f"<h2>{heading}</h2>{views.pages.picture_as_html(options.out / name)}")
+                pictures.append(views.pages.picture_as_html(options.out / name, heading))
         audit = "\n".join([HEADING, *texts[1:]])
         plan_text, audit = (f"<pre>{escape(text)}</pre>" for text in (str(parking), audit))
         sections = "".join([*pictures[:1], plan_text, "<h2>Energy against work</h2>", audit, *pictures[1:]])

@@ -263,7 +263,7 @@ def write(options: argparse.Namespace) -> views.pages.Outputs:
         rows = views.pages.table_as_html(rows_of(options, tables[arena]), 1)
         sections += f"<h2>Time until it has turned over, {heading}</h2>{rows}"
     sections += "".join(f'<p class="note">{escape(line)}</p>' for line in (claim, remark(options), *described(options)))
-    sections += "".join(f"<h2>θ(t)</h2>{views.pages.picture_as_html(path)}" for path in pictures)
+    sections += "".join(views.pages.picture_as_html(path, "θ(t)") for path in pictures)
     path = options.out / "index.html"
     views.Page((live or views.pages.page_of_job(list, TITLE, 1.0, BELOW).html).replace(BELOW, sections)).save(path)
     return views.pages.Outputs(turned_over.size, [*paths.values(), *pictures], path, cache if read else None)

@@ -286,7 +286,7 @@ def write(options: argparse.Namespace) -> views.pages.Outputs:
         if views.pages.can_draw():
             files.append(options.out / "theta.png")
             picture(options, by_arena).savefig(files[-1], dpi=130)
-            sections += "<h2>θ(t) of every launch</h2>" + views.pages.picture_as_html(files[-1])
+            sections += views.pages.picture_as_html(files[-1], "θ(t) of every launch")
         path = options.out / "index.html"
         views.pages.page_of_job(lambda: motions(options, by_arena), "A tippe top turns over", 0.5, sections).save(path)
     return views.pages.Outputs(sum(table.status.size for table in by_arena.values()), files, path)

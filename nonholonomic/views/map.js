@@ -134,6 +134,7 @@ function makeMap(box, live, integrator, choose) {
       pen.fillStyle = colours[word] || "#ffffff";
       pen.fillRect(0, 0, 13, 13);
       hatch(pen, 0, 0, 13, 13);
+      box.setAttribute("aria-hidden", "true");
       legend.append(entry(box, word === "illegal" ? "not possible" : word.replace(/_/g, " ")));
     }
   }

@@ -145,10 +145,10 @@ def table_as_html(rows: list[list[str]], heads: int) -> str:
     return f'<div class="wide"><table>{"".join(parts)}</table></div>'
 
 
-def picture_as_html(path: Path) -> str:
-    """A PNG file as an HTML image with embedded data."""
-    coded = base64.b64encode(path.read_bytes()).decode()
-    return f'<div class="wide"><img alt="" src="data:image/png;base64,{coded}"></div>'
+def picture_as_html(path: Path, heading: str) -> str:
+    """A PNG file as an HTML image with embedded data, below a heading that also describes the image."""
+    coded, text = base64.b64encode(path.read_bytes()).decode(), html.escape(heading)
+    return f'<h2>{text}</h2><div class="wide"><img alt="plot: {text}" src="data:image/png;base64,{coded}"></div>'
 
 
 def script(text: str, attributes: str = "") -> str:

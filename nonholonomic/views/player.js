@@ -134,10 +134,11 @@ window.views = window.views || {};
       element("button", tools, { id: "save-picture", type: "button", innerHTML: "<span>Save </span>picture", title: "a PNG file of this moment", onclick: () => {
         this.root.classList.add("filming");
         this.seek(this.now);
-        const canvas = views.blank(this);
-        views.paint(canvas, this, `${this.now.toFixed(3)} s`);
+        // A page that plays is at another time when the file is ready.
+        const canvas = views.blank(this), time = this.now.toFixed(3);
+        views.paint(canvas, this, `${time} s`);
         this.root.classList.remove("filming");
-        canvas.toBlob((blob) => save(blob, `-${this.now.toFixed(3)}s.png`));
+        canvas.toBlob((blob) => save(blob, `-${time}s.png`));
       } });
       let form = null;
       film.setAttribute("aria-expanded", "false");

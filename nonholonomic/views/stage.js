@@ -76,10 +76,14 @@ window.views = window.views || {};
     // Without WebGL, a text stands in place of the picture; curves and sliders work.
     drawer() {
       try {
-        return new this.THREE.WebGLRenderer({ antialias: true });
+        const renderer = new this.THREE.WebGLRenderer({ antialias: true }), { title, shows } = this.fact;
+        const words = [title, ...new Set(shows.map((run) => run.name))].filter(Boolean).join(", ") || document.title;
+        renderer.domElement.setAttribute("role", "img");
+        renderer.domElement.setAttribute("aria-label", `3D view: ${words}`);
+        return renderer;
       } catch (error) {
         this.box.classList.add("flat");
-        const words = `This picture needs WebGL, which the browser does not provide (${error.message}). Open the page in another browser, or switch on hardware acceleration.`;
+        const words = `This picture needs WebGL, which the browser does not provide (${error.message.replace(/\.+$/, "")}). Open the page in another browser, or switch on hardware acceleration.`;
         const domElement = element("p", this.box, { className: "warning", textContent: words });
         return { domElement, shadowMap: {}, setPixelRatio() {}, setSize() {}, render() {} };
       }
@@ -242,7 +246,8 @@ window.views = window.views || {};
     look(points, follow) {
       const focus = [0, 1, 2].map((c) => points.reduce((sum, point) => sum + point[c], 0) / points.length);
       const apart = max(...points.map((point) => hypot(...point.map((x, c) => x - focus[c]))));
-      const span = 3.6 * this.size + apart, { camera, controls } = this;
+      // Bodies that part need more distance in a picture that is not wider than it is high.
+      const span = 3.6 * this.size + (this.camera.aspect < 1.3 ? 1.3 : 1) * apart, { camera, controls } = this;
       if (this.focus && follow) {
         ["x", "y", "z"].forEach((axis, c) => {
           const away = ((camera.position[axis] - controls.target[axis]) * span) / this.span;

@@ -58,6 +58,7 @@ window.views = window.views || {};
   // A piece of the curve of a run, for legends.
   function sample(parent, { colour, dashes }) {
     const end = { width: 30, height: 4 }, canvas = views.element("canvas", parent, { className: "sample", ...end }), pen = canvas.getContext("2d");
+    canvas.setAttribute("aria-hidden", "true");
     Object.assign(pen, { strokeStyle: colour, lineWidth: 4 });
     pen.setLineDash(dashes ?? []); pen.beginPath(); pen.moveTo(0, 2); pen.lineTo(30, 2); pen.stroke();
   }
@@ -91,6 +92,8 @@ window.views = window.views || {};
         const box = views.element("div", fold || parent, { className: "strip" }), head = views.element("div", box, { className: "head" });
         views.element("span", head, { textContent: label });
         const value = views.element("span", head, { className: "value" }), canvas = views.element("canvas", box);
+        canvas.setAttribute("role", "img");
+        canvas.setAttribute("aria-label", `curve of ${label} over time; a click sets the time`);
         // Below the first curve, where they cover none.
         const told = k === 0 ? views.element("div", box, { className: "told" }) : null;
         const strip = { label, canvas, value, told };

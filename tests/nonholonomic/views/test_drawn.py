@@ -25,7 +25,7 @@ from nonholonomic.views import (
     Trace,
     page,
 )
-from nonholonomic.views.pages import Viewable
+from nonholonomic.views.pages import Viewable, picture_as_html
 from nonholonomic.views.plot import draw_series
 from nonholonomic.views.stage import arena, ball, quaternion
 
@@ -147,7 +147,12 @@ def test_a_page_saves_films_and_pictures(tmp_path):
         ActionChains(driver).send_keys(Keys.ENTER, "0.4", Keys.TAB, "2", Keys.TAB, Keys.ENTER).perform()
         wait(driver, "return document.querySelector('#film output').value === 'saved'")
         assert driver.execute_script("return player.time()") == pytest.approx(1.3)
-        driver.execute_script("document.getElementById('save-picture').focus()")
+        # The file has the time of the picture, also on a page that is at another time when the file is ready.
+        driver.execute_script(
+            "const { toBlob } = HTMLCanvasElement.prototype; HTMLCanvasElement.prototype.toBlob = function (then) {"
+            " toBlob.call(this, (blob) => { player.seek(0.5); then(blob); }); };"
+            "document.getElementById('save-picture').focus()"
+        )
         ActionChains(driver).send_keys(Keys.ENTER).perform()
         deadline = time.monotonic() + 30.0
         while not ((tmp_path / "A-ball.webm").exists() and (tmp_path / "A-ball-1.300s.png").exists()):
@@ -261,6 +266,14 @@ def test_a_page_holds_its_numbers_in_single_precision():
     np.testing.assert_array_equal(triangles, stage.arena.mesh.triangles.ravel())
     # The page of two balls, with three.js.
     assert len(html) < 4e5
+
+
+def test_a_picture_has_its_heading_as_a_description(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"PNG")
+    text = picture_as_html(tmp_path / "a.png", "a < b")
+    assert text.startswith(
+        '<h2>a &lt; b</h2><div class="wide"><img alt="plot: a &lt; b" src="data:image/png;base64,UE5H"'
+    )
 
 
 def test_a_page_without_motion_has_no_script(tmp_path):

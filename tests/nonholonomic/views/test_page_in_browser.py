@@ -125,6 +125,19 @@ def test_the_camera_keeps_all_runs_of_a_place_in_sight(browser):
             assert view_offset @ view_direction / np.linalg.norm(view_offset) > np.cos(np.radians(angle / 2.0))
 
 
+def test_a_narrow_picture_keeps_bodies_that_part_in_sight(browser):
+    """On a phone, in whatever direction they part; where they are drawn, the picture reaches from -1 to 1."""
+    places = browser.execute_script(
+        "const stage = player.stages[1], { box, camera, THREE } = stage;"
+        "box.style.width = '100px'; stage.fit(); player.seek(0);"
+        "const places = [[40, 0], [0, 40], [28, 28], [28, -28]].map(([x, y]) => {"
+        " const points = [[0, 0, 0], [x, y, 0]]; stage.look(points, true); stage.render(); camera.updateMatrixWorld();"
+        " return points.map((point) => new THREE.Vector3(...point).project(camera)).map((at) => [at.x, at.y]); });"
+        "box.style.width = ''; stage.fit(); player.seek(0); stage.reset(); stage.render(); return places"
+    )
+    assert np.max(np.abs(places)) < 0.97
+
+
 CENTRES = """
 return [...document.querySelectorAll('#controls button, #controls input, #controls select, .buttons button, .chip')]
   .map((one) => { one.scrollIntoView({ block: 'center' }); const box = one.getBoundingClientRect();
@@ -208,6 +221,35 @@ def test_the_curves_of_several_runs_are_named_in_their_colours(browser, stages):
         f"player.seek(0.3); return {chips}.map((all) => all.map((one) => one.style.color))"
     )
     assert [numbers[-1], numbers[0]] == [colours[1:], []]
+
+
+def test_chips_can_be_read_and_touched(browser):
+    """Pressed or not, the colours of runs and names have a contrast of 4.5 to 1 on them; they and menus are 24 pixels high."""
+    chips = (
+        "const hide = document.querySelectorAll('figure:last-child .chip'); hide[0].click();"
+        "const told = [...hide].map((one) => { const { color, backgroundColor, opacity } = getComputedStyle(one);"
+        " return [color, backgroundColor, opacity, one.getAttribute('aria-pressed')]; }); hide[0].click();"
+        "return [told, [...document.querySelectorAll('#view button, #view select')].map((one) => one.offsetHeight)]"
+    )
+    told, heights = browser.execute_script(chips)
+    assert {pressed for *_, pressed in told} == {"true", "false"}
+    for colour, background, opacity, _ in told:
+        assert opacity == "1"
+        texts = [colour, *(f"{c >> 16}, {c >> 8 & 255}, {c & 255}" for c in COLOURS)]
+        assert min(contrast(text, background) for text in texts) > 4.5
+    assert min(heights) >= 24
+
+
+def test_pictures_have_names_for_screen_readers(browser, stages):
+    names = browser.execute_script(
+        "return ['.scene > canvas', '.strip canvas'].map((kind) => [...document.querySelectorAll(kind)]"
+        ".map((one) => [one.getAttribute('role'), one.getAttribute('aria-label')]))"
+    )
+    assert {role for kind in names for role, _ in kind} == {"img"}
+    scenes, curves = ([label for _, label in kind] for kind in names)
+    assert [stage.title in label for stage, label in zip(stages, scenes, strict=True)] == [True, True]
+    assert curves[0].startswith("curve of inclination θ [deg] over time")
+    assert len(set(curves)) == 7
 
 
 def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
@@ -423,7 +465,7 @@ def test_a_browser_without_webgl_says_so_and_shows_the_curves(browser, stages, t
         wait(browser, "return !!window.player")
         assert browser.execute_script(
             "player.seek(0.25); return [...document.querySelectorAll('.scene')]"
-            ".every((one) => one.textContent.includes('needs WebGL'))"
+            ".every((one) => /needs WebGL.*[^.]\\)\\. Open/.test(one.textContent))"
         )
         values = browser.execute_script(
             "return [...document.querySelectorAll('.strip .value')].map((one) => one.textContent)"
