@@ -5,7 +5,6 @@ each a `Part` of a program that the loops of a language call. `solve_smooth`, `s
 `solve_in_modes` run the cells of a table by a `Kernel`, and `by_kernel` does so if there is a GPU and the table is large.
 """
 
-from .device_code import Kernel as Kernel
 from .device_code import solve_in_modes as solve_in_modes
 from .device_code import solve_smooth as solve_smooth
 from .device_code import solve_smooth_with_samples as solve_smooth_with_samples
@@ -18,5 +17,4 @@ from .gpu import require_device as require_device
 from .motions import HybridRuns as HybridRuns
 from .motions import HybridStart as HybridStart
 from .motions import Part as Part
-from .motions import SmoothRuns as SmoothRuns
 from .scalar_code import javascript as javascript

@@ -8,4 +8,3 @@ from .form import Hybrid as Hybrid
 from .mechanics import AbstractMode as AbstractMode
 from .mechanics import AbstractSystem as AbstractSystem
 from .model import OwnModel as OwnModel
-from .model import page_of_system as page_of_system

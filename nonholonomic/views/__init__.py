@@ -2,7 +2,6 @@
 them."""
 
 from .pages import Page as Page
-from .pages import page as page
 from .pages import stage_of as stage_of
 from .plot import draw_fit as draw_fit
 from .stage import COLOURS as COLOURS

@@ -167,6 +167,12 @@ def test_a_length_that_was_assumed_is_the_first_to_be_doubted():
         tippe.Top.turned(radius=0.019, mass=0.018, stem_radius=0.003, stem_length=0.012)
 
 
+def test_a_diameter_for_a_radius_is_asked_about():
+    numbers = {"mass": 0.03, "cut": 0.015, "stem_radius": 0.005, "stem_length": 0.012}
+    with pytest.raises(ValueError, match=r"; is radius = 0.04 the diameter\?; cut = [\d.]+ would do$"):
+        tippe.Top.turned(radius=0.04, hole_radius=0.012, hole_depth=0.02, **numbers)
+
+
 def test_a_shape_that_no_single_length_mends_is_refused_without_advice():
     with pytest.raises(ValueError, match=r"radius = 0.0 must be greater than 0.0$"):
         tippe.Top.turned(density=700.0, **SHAPE | {"radius": 0.0})

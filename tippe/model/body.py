@@ -184,6 +184,10 @@ def _remedy(lengths: dict[str, Any], message: str) -> str:
     numbers = {name: as_number(0.0 if value is None else value) for name, value in lengths.items()}
     if any(not isinstance(number, jax.Array) or is_traced(number) or number.ndim for number in numbers.values()):
         return message
+    for diameter in ("stem_radius", "radius"):
+        with contextlib.suppress(ValueError):
+            _turned(lengths | {diameter: 0.5 * float(numbers[diameter])}, np)
+            message += f"; is {diameter} = {shown(lengths[diameter])} the diameter?"
     names = ("stem_length", "cut", "hole_radius", "hole_depth", "stem_radius")
     assumed = [name for name in ASSUMED if lengths[name] is None]
     for name in sorted(names, key=lambda name: (name not in assumed, not message.startswith(name))):

@@ -297,7 +297,7 @@ class AbstractTrajectory(AbstractRun):
         ]
         if set(tops) != {"own top"}:
             # The names of presets say more than their numbers.
-            starts = [(top, *start) for top, start in zip(tops, starts, strict=True)]
+            starts = [(top.replace("_", " "), *start) for top, start in zip(tops, starts, strict=True)]
         if tops.count("own top") < 2:
             scenes = [eqx.tree_at(lambda scene: scene.body, scene, scenes[0].body) for scene in scenes]
         return distinguishing_labels(starts, scenes, unit=unit)

@@ -11,8 +11,8 @@ from own_modes import Pendulum
 import stroller
 import tippe
 from nonholonomic import simulate
-from nonholonomic.views import COLOURS, page
-from nonholonomic.views.pages import table_as_html
+from nonholonomic.views import COLOURS
+from nonholonomic.views.pages import page, table_as_html
 from nonholonomic.views.stage import css, curves_in
 
 pytestmark = needs_browser
