@@ -197,4 +197,4 @@ def test_in_a_cylinder(restitution):
     across = np.pi - math.acos((far**2 + length**2 - near**2) / (2.0 * far * length))
     assert across < run.at([run.stem_time]).theta[0] < first_contact(top)
     last = tippe.inversion_time(scene, LAUNCH, 4.0, tolerance=TOLERANCE, crossing="last")
-    assert last >= run.t[run.contact == 0].max()
+    assert last > run.t[run.contact == 0].max() - 1e-8

@@ -886,9 +886,10 @@ class ExtendedTime(EventTime):
         is_good = is_legal & (outcome.status != FAILED)
         times = jnp.where(is_good, extended(problem, state), jnp.nan)
         # Second derivatives through a loss of contact would lack the second variation of its time.
-        is_good &= ~(is_lost & nested)
+        # A factor, because the derivative of a NaN that is selected would be 0.
+        factor = jnp.where(is_good & ~(is_lost & nested), 1.0, jnp.nan)
         slopes = [
-            jnp.where(is_good, eqx.filter_jvp(extended, (problem, state), direction)[1], jnp.nan)
+            factor * eqx.filter_jvp(extended, (problem, state), direction)[1]
             for direction in zip(tangents, variations, strict=True)
         ]
         return times, slopes
