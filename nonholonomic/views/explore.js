@@ -56,7 +56,7 @@
   // The word for the end of a run until the answer, and what the whole run has done after that: a top may fall back.
   function wordsOf([status, found]) {
     const after = Number.isFinite(found) && facts.afterwards.length ? facts.afterwards[moves.read("outcome", values)[0]] : "";
-    return [(words[status] || "illegal").replace(/_/g, " "), after].filter(Boolean);
+    return [wordFor(words[status] || "illegal", facts.answer.horizon), after].filter(Boolean);
   }
   function tell(outcome, run, took) {
     const found = outcome[1], word = wordsOf(outcome).join(", but ");

@@ -1,6 +1,11 @@
 // A map of runs over two of the sliders, filled in the background by workers, coarse cells first.
 "use strict";
 
+// The end of a run for readers: a run without its event may have it after the horizon of the page.
+function wordFor(word, horizon) {
+  return word === "illegal" ? "not possible" : word.startsWith("not_") ? `not within ${Number(horizon.toPrecision(4))} s` : word.replace(/_/g, " ");
+}
+
 function makeMap(box, live, integrator, choose) {
   const across = 40, up = 30, levels = [8, 4, 2, 1], chunk = 24;
   const { sliders, words, answer } = live.facts;
@@ -135,7 +140,7 @@ function makeMap(box, live, integrator, choose) {
       pen.fillRect(0, 0, 13, 13);
       hatch(pen, 0, 0, 13, 13);
       box.setAttribute("aria-hidden", "true");
-      legend.append(entry(box, word === "illegal" ? "not possible" : word.replace(/_/g, " ")));
+      legend.append(entry(box, wordFor(word, answer.horizon)));
     }
   }
 

@@ -35,7 +35,7 @@ from ..hybrid import AbstractBatchedMode, HybridOutcome
 from ..integration.problem import Settings, Status
 from ..kernels import HybridRuns, HybridStart, Part, javascript
 from ..terminal import status_line
-from ..text import Unit, require_unit, shown, unit_of
+from ..text import Unit, distinguishing_labels, require_unit, shown, unit_of
 from ..validation import replacing, require, require_file, require_increasing, require_package
 from .stage import Arrow, Draw, Kind, Marks, Stage, Trace, converted, css, curves_in, finite
 
@@ -437,11 +437,12 @@ def require_others(run: object, others: object) -> Sequence[Any]:
 
 
 def require_labels(label: Label, runs: Sequence[object]) -> list[str]:
-    """The labels of runs, one for each. **Raises:** `ValueError` if there is another number of them."""
+    """The labels of runs, one for each; those of several runs are shortened. **Raises:** `ValueError` if there is another
+    number of them."""
     labels = [label] if isinstance(label, str) else label
     if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
         raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
-    return list(labels)
+    return list(labels) if len(labels) == 1 else distinguishing_labels([(text,) for text in labels])
 
 
 # Films, recorded by a browser.
@@ -665,7 +666,7 @@ def programs(live: LiveRun) -> str:
     facts = {
         "sliders": [slider._asdict() for slider in live.sliders],
         "words": {int(status): status.word for status in Status},
-        "answer": {"label": live.label, "unit": live.unit},
+        "answer": {"label": live.label, "unit": live.unit, "horizon": live.answer.t1},
         "summaries": live.summaries,
         "afterwards": live.afterwards,
     }

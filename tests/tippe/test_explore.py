@@ -224,6 +224,8 @@ def test_a_slider_simulates_anew(browser, page, rutstam_scene):
     theta, spin = browser.execute_script("return live.values()")
     assert (theta, spin) == pytest.approx((0.1, 95.0))
     time = float(tippe.inversion_time(rutstam_scene, tippe.Launch(theta, spin), 7.0))
+    told = "return document.querySelector('#result strong').textContent"
+    assert (browser.execute_script(told) == "not within 7 s") == (time > 7.0)
     shown_time = browser.execute_script("return Number.isFinite(live.outcome.value) ? live.outcome.value : 1e300")
     assert shown_time == pytest.approx(min(time, 1e300), rel=CLOSE)
     # The drawn top is that of the new run.
@@ -298,7 +300,7 @@ def test_the_map_fills_and_a_click_sets_the_sliders(browser, page, rutstam_scene
     assert tippe.Status(status).word == table.status
     assert time is None or time == pytest.approx(float(table.time), rel=CLOSE)
     # Cells without a time are hatched, and their status is named.
-    wait(browser, "return document.getElementById('legend').textContent.includes('not inverted')")
+    wait(browser, "return document.getElementById('legend').textContent.includes('not within 7 s')")
     colours = browser.execute_script(
         """const { cells, results } = live.map, canvas = document.querySelector('#map canvas');
         const { x, y } = cells.find((_, k) => results()[k] && !Number.isFinite(results()[k][1]));

@@ -270,6 +270,8 @@ def test_labels_are_what_differs(run):
     assert panel.get_legend().get_texts()[0].get_text() == "my top"
     assert run.plot("theta").axes[0].get_legend() is None
     assert run.plot("theta").get_suptitle() == run.plot().get_suptitle() == "rutstam top, θ(0) = 0.1 rad, 155 rad/s"
+    long = [f"a rough table at {k} degrees Celsius, in the morning" for k in (20, 30)]
+    assert texts(label=long) == ["a rough table at 20 degrees C…", "a rough table at 30 degrees C…"]
     for options in ({}, {"overlaid": True}):
         stages = run.stages([other], label=["rough", "smooth"], **options)
         assert [show.name for stage in stages for show in stage.shows] == ["rough", "smooth"]

@@ -74,8 +74,8 @@ def quantities_of(scene: Scene) -> dict[str, Quantity]:
 
 # The run of a top: one state at each time.
 
-#: What a top may do after it turned over: nothing, or lean less than 90 degrees, or stand on its sphere beside its stem.
-AFTERWARDS = ("", "fell back", "its sphere touches again")
+#: What a top may do after it turned over: nothing, or fall back, so that it leans less than 90 degrees or stands on its sphere.
+AFTERWARDS = ("", "fell back")
 
 #: JAX's arrays, or NumPy's outside of transformations.
 Values: TypeAlias = Array | np.ndarray
@@ -312,10 +312,11 @@ class AbstractTrajectory(AbstractRun):
 
     @property
     def afterwards(self) -> Int[Array, ""]:
-        """What a top that turned over has done by the last time, as an index of `AFTERWARDS`."""
+        """What a top that turned over has done by the last time, as an index of `AFTERWARDS`: it fell back if it is below
+        90 degrees, or if it stands on its sphere again after its stem carried it."""
         is_told = self.scene.has_stem and self.scene.contact == "hybrid"
         again = is_told and (self.contact[-1] >= 0) & (self.contact[-1] != 1)
-        return jnp.where(self.theta[-1] < 0.5 * jnp.pi, 1, jnp.where(again, 2, 0))
+        return jnp.where((self.theta[-1] < 0.5 * jnp.pi) | again, 1, 0)
 
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:
