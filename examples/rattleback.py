@@ -26,17 +26,18 @@ def scene(angle: Any) -> tippe.Scene:
 def draw() -> Any:
     """The plot, a matplotlib figure."""
     figure, (motion, times) = plt.subplots(1, 2, figsize=(10.0, 3.6), layout="constrained")
-    for spin in (-5.0, 5.0):
+    for spin, colour in ((-5.0, "C0"), (5.0, "C3")):
         run = tippe.simulate(scene(0.0143), tippe.Launch(TILT, spin), t1=12.0, tolerance=1e-8)
-        motion.plot(run.t, run.normal_spin, lw=0.8, label=f"spun at {spin:+g} rad/s")
+        motion.plot(run.t, run.normal_spin, lw=0.8, color=colour, label=f"spun at {spin:+g} rad/s")
 
         def reversal(angle: Any, spin: float = spin) -> Any:
             return tippe.reversal_time(scene(angle), tippe.Launch(TILT, spin), t1=15.0, tolerance=1e-8)
 
-        times.plot(ANGLES, jax.vmap(reversal)(ANGLES), ".", label=f"spun at {spin:+g} rad/s")
+        times.plot(ANGLES, jax.vmap(reversal)(ANGLES), ".", color=colour, label=f"spun at {spin:+g} rad/s")
     motion.axhline(0.0, color="gray", lw=0.5)
     motion.set(xlabel="time [s]", ylabel="spin about the vertical [rad/s]")
     times.set(xlabel="angle from curvature to inertia [rad]", ylabel="time of the first reversal [s]")
+    times.locator_params(axis="x", nbins=5)
     for ax in (motion, times):
         ax.legend(fontsize=8)
     plt.close(figure)

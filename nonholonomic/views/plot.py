@@ -4,7 +4,7 @@ import io
 import itertools
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -43,8 +43,8 @@ MOST_POINTS = 2000
 #: A map of whole numbers with at most this many values has a colour for each.
 MOST_COLOURS = 10
 
-#: Size of a panel [inches], and number of characters for which a legend or a title above it has room.
-PANEL, WIDTH = (7.0, 2.0), 90
+#: Size of a panel [inches], and numbers of characters for which a legend or a title above it, and a label beside it, have room.
+PANEL, WIDTH, HEIGHT = (7.0, 2.0), 90, 26
 
 #: The ratio of the ranges of components named x, y and z below which they are a path, with one scale.
 EQUAL = 4.0
@@ -63,6 +63,17 @@ def new_figure(width: float = 7.0, height: float = 4.5) -> "Figure":
 
     figure._repr_png_ = png
     return figure
+
+
+def coloured(panel: "Axes") -> "Axes":
+    """Give axes the colours of a page, which stand out from white; lines beyond these colours are dashed.
+
+    **Returns:** the axes.
+    """
+    from matplotlib.rcsetup import cycler
+
+    panel.set_prop_cycle(cycler(linestyle=STYLES) * cycler(color=[css(colour) for colour in COLOURS]))
+    return panel
 
 
 def draw_title(figure: Any, text: str) -> None:
@@ -115,7 +126,7 @@ def draw_table(
     if has_status:
         words, fell = (_slice(part, dims, names, cut) for part in (table["status"], fell))
         words = np.where(fell, fallen, words)
-    drawing = new_figure().add_subplot() if ax is None else ax
+    drawing = coloured(new_figure().add_subplot()) if ax is None else ax
     cuts = [_cut_text(table, name, place, at.get(name)) for name, place in cut.items()]
     is_diagram = x is None and len(names) == 2 and names[0] == "crossing"
     is_map = len(names) == 2 and not is_diagram and (y is not None or len(table.coords[names[1]]) > MOST_LINES)
@@ -217,7 +228,9 @@ def _draw_lines(
     drawing: "Axes", table: "Table", names: list[str], lines: np.ndarray, label: str | None, words: np.ndarray | None
 ) -> None:
     """Draw a line for each column, and in a strip above them the statuses of cells without a finite value."""
-    marker, values = "o-" if len(lines) <= 100 else "-", table.coords[names[0]]
+    # Nothing lies between two crossings.
+    values, style = table.coords[names[0]], "" if names[0] == "crossing" else None
+    marker = "o" if style == "" or len(lines) <= 100 else None
     has_number = np.isfinite(lines)
     lost = np.full(lines.shape, "") if words is None else np.where(has_number, "", words.reshape(lines.shape))
     marks = dict(zip(filter(None, np.unique(lost).tolist()), "x+1234", strict=False))
@@ -234,7 +247,7 @@ def _draw_lines(
     for index, line in enumerate(lines.T):
         texts = [label or "", _cut_text(table, names[1], index) if len(names) > 1 else ""]
         text = ", ".join(filter(None, texts))
-        (curve,) = drawing.plot(values, line, marker, markersize=3, label=text or None)
+        (curve,) = drawing.plot(values, line, marker=marker, markersize=3, linestyle=style, label=text or None)
         for word, mark in marks.items():
             strip.plot(values, np.where(lost[:, index] == word, rows[index], np.nan), mark, color=curve.get_color())
     for word, mark in marks.items() if len(marks) > 1 else ():
@@ -309,8 +322,8 @@ def draw_portrait(table: "Table", x: str, y: str, ax: "Axes | None" = None) -> "
     **Raises:** `ValueError` for an unknown variable or component.
     """
     (x_values, x_label), (y_values, y_label) = column(table, "x", x), column(table, "y", y)
-    drawing = new_figure(5.0, 4.5).add_subplot() if ax is None else ax
-    (line,) = drawing.plot(x_values, y_values, linewidth=1.0, color=css(COLOURS[0]) if ax is None else None)
+    drawing = coloured(new_figure(5.0, 4.5).add_subplot()) if ax is None else ax
+    (line,) = drawing.plot(x_values, y_values, linewidth=1.0)
     drawing.plot(x_values[:1], y_values[:1], "o", color=line.get_color())
     drawing.set_xlabel(x_label)
     drawing.set_ylabel(y_label)
@@ -371,13 +384,10 @@ def draw_series(
         raise ValueError(f"ax takes one quantity, not {len(names)}: {', '.join(names)}")
     if ax is None:
         figure = new_figure(PANEL[0], 1.5 + PANEL[1] * len(names))
-        panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-        for panel in panels:
-            # The colours of a page.
-            panel.set_prop_cycle(color=[css(colour) for colour in COLOURS])
+        panels = [coloured(panel) for panel in figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]]
     else:
         figure, panels = None, [ax]
-    explained: list[str] = []
+    explained: set[str] = set()
     for panel, name in zip(panels, names, strict=True):
         for table, label, marked in zip(tables, labels, marks, strict=True):
             colour, dims = None, table.inner.get(name, ())
@@ -388,15 +398,17 @@ def draw_series(
             else:
                 values, quantity = column(table, "quantity", name, vectors=True)
                 lines = [("", values)]
-            for k, ((component, values), style) in enumerate(zip(lines, itertools.cycle(STYLES))):
+            for k, ((component, values), line_style) in enumerate(zip(lines, itertools.cycle(STYLES))):
                 # Of several runs, colours and styles are explained apart, each once.
                 text = ", ".join(filter(None, (label, component))) if len(tables) == 1 else "" if k else label
+                style = {"color": colour, "linestyle": line_style} if k and len(tables) > 1 else {}
                 # A line without a text stays out of the legend.
-                (line,) = panel.plot(table["time"], values, style, linewidth=1.2, color=colour, label=text or None)
-                colour = line.get_color()
+                (line,) = panel.plot(table["time"], values, linewidth=1.2, label=text or None, **style)
+                colour = colour or line.get_color()
             for time, words in marked:
                 panel.axvline(time, color=colour, linestyle=":", linewidth=1.2, label=words)
-            panel.set_ylabel(quantity)
+            parts = [quantity] if len(quantity) <= HEIGHT else quantity.rsplit(" [", 1)
+            panel.set_ylabel("\n[".join(textwrap.fill(part, HEIGHT) for part in parts))
         for (component, _), style in zip(lines if len(tables) > 1 and lines[0][0] else (), itertools.cycle(STYLES)):
             panel.plot([], [], style, color="0.35", linewidth=1.2, label=component)
         panel.margins(x=0.0)
@@ -404,21 +416,21 @@ def draw_series(
         middle, least = np.mean(panel.get_ylim()), LEAST_RANGE * np.max(np.abs(panel.get_ylim()))
         if np.ptp(panel.get_ylim()) < least:
             panel.set_ylim(middle - least, middle + least)
-        # Not again below a panel that has the same.
-        if (texts := panel.get_legend_handles_labels()[1]) != explained:
-            legend_above(panel)
-            explained = texts
+        legend_above(panel, explained)
+        explained.update(panel.get_legend_handles_labels()[1])
     panels[-1].set_xlabel(tables[0].label("time"))
     return figure or panels[0]
 
 
-def legend_above(panel: "Axes") -> None:
-    """Draw the legend of a panel, if it has one, above it, where it covers no curve."""
-    handles, texts = panel.get_legend_handles_labels()
-    if texts:
-        texts = [textwrap.fill(text, WIDTH) for text in texts]
-        columns = min(len(texts), max(1, WIDTH // (max(map(len, texts)) + 6)))
-        panel.legend(handles, texts, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize="small")
+def legend_above(panel: "Axes", explained: Container[str]) -> None:
+    """Draw the legend of a panel, without what is explained, above it, where it covers no curve."""
+    pairs = zip(*panel.get_legend_handles_labels(), strict=True)
+    handles = {textwrap.fill(text, WIDTH): handle for handle, text in pairs if text not in explained}
+    if texts := list(handles):
+        columns = min(len(texts), max(1, WIDTH // (max(map(len, texts)) + 10)))
+        panel.legend(
+            handles.values(), texts, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize="small"
+        )
 
 
 # The picture of a fit: data and model, residuals, distributions and correlations.

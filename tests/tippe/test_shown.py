@@ -200,8 +200,9 @@ def test_quantities_are_drawn_over_time_by_name_and_in_degrees(run):
     assert panels[1].get_xlabel() == "time [s]"
     assert [text.get_text() for text in panels[1].get_legend().get_texts()] == ["x", "y", "z"]
     assert_close(panels[1].get_lines()[1].get_ydata(), run.position[:, 1])
+    assert [line.get_color() for line in panels[1].get_lines()] == [css(colour) for colour in views.COLOURS[:3]]
     (component,) = run.plot(["position.y"], unit=("cm", "ms")).axes
-    assert (component.get_ylabel(), component.get_xlabel()) == ("position of the centre, y [cm]", "time [ms]")
+    assert (component.get_ylabel(), component.get_xlabel()) == ("position of the centre, y\n[cm]", "time [ms]")
     assert_close(component.get_lines()[0].get_xydata(), np.stack([1e3 * run.t, 100.0 * run.position[:, 1]], axis=-1))
     (spin,) = run.plot("spin", unit=["deg", "rpm"]).axes
     assert spin.get_ylabel() == "spin ω₃ [rpm]"
@@ -266,6 +267,13 @@ def test_labels_are_what_differs(run):
     assert colours == [[css(colour) for colour in views.COLOURS[:2]]] * 2
     legend = figures[0].axes[0].get_legend()
     assert [text.get_text() for text in legend.get_texts()] == ["mu 0.3 s/m", "mu 0.2 s/m"]
+    # A name stands above one panel; lines beyond the colours are dashed.
+    _, slip, last = run.plot("theta", "slip", "energy", others=[other]).axes
+    assert [text.get_text() for text in slip.get_legend().get_texts()] == ["t1", "t2"]
+    assert last.get_legend() is None
+    first, *_, seventh = run.plot("theta", others=6 * [other]).axes[0].get_lines()
+    assert seventh.get_color() == first.get_color()
+    assert [first.get_linestyle(), seventh.get_linestyle()] == ["-", "--"]
     (panel,) = run.plot("theta", label="my top").axes
     assert panel.get_legend().get_texts()[0].get_text() == "my top"
     assert run.plot("theta").axes[0].get_legend() is None

@@ -57,8 +57,9 @@ def test_a_diagram_is_drawn_as_points_over_its_number(diagram):
     assert_close(np.sort(np.unique(points.get_xdata())), [2.8, 3.2, 3.4])
     assert len(points.get_ydata()) == 18
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("rate", "y0")
-    # A single run is a line over its crossings.
+    # A single run has points over its crossings.
     (axes,) = diagram.plot("y0", at={"rate": 3.2}).axes
+    assert [line.get_linestyle() for line in axes.lines] == ["None"]
     assert axes.get_xlabel() == "crossing"
 
 

@@ -12,6 +12,7 @@ from cheap_sweep import cheap_sweep
 from close import assert_close
 
 from nonholonomic.sweeps import Table
+from nonholonomic.views.stage import COLOURS, css
 
 THETA, SPIN, MU = np.linspace(0.1, 0.4, 4), np.linspace(60.0, 160.0, 11), np.array([0.1, 0.2, 0.3])
 
@@ -74,6 +75,7 @@ def test_axes_labels_and_units_are_chosen(table):
     assert texts == [f"a top, θ(0) = {theta:.4g} deg" for theta in np.degrees(THETA)]
     (third,) = (line for line in lines.get_lines() if line.get_label() == texts[2])
     assert_close(third.get_xydata(), np.stack([MU, table.time[2, :, 1]], axis=-1))
+    assert third.get_color() == css(COLOURS[2])
     chart = table.plot(x="spin", y="theta", unit=["deg", "rpm"], label="a top").axes[0]
     assert (chart.get_xlabel(), chart.get_ylabel()) == ("spin [rpm]", "θ(0) [deg]")
     assert chart.get_title() == "a top, friction μ = 0.1 s/m"
