@@ -16,7 +16,7 @@ from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit, shown
 from nonholonomic.validation import explaining, require_flag, require_kind, require_package, require_whole
 from nonholonomic.views.pages import Page, page, require_page
-from nonholonomic.views.plot import draw_title, new_figure
+from nonholonomic.views.plot import draw_title, legend_above, new_figure
 from nonholonomic.views.stage import DARK, Body, Mesh, Stage, bar, curves_in, fixed, of_grid, own
 
 from ..model.scene import Dynamics, Launch, Number, Scene, padded
@@ -144,14 +144,14 @@ class Plan(eqx.Module):
             draw(corners[CLOSED], "C0", 0.6, "footprint")
         draw(self.run.position, "C0", 1.5, "rear axle")
         draw(target.mean(axis=0)[None] if is_cross else target[CLOSED], "C2", 1.2, "goal", "x" if is_cross else "")
+        if not is_cross:
+            # An arrow from the rear to the front.
+            tip, (right, left) = target[:2].mean(axis=0), 0.5 * (target[:2] + target.mean(axis=0))
+            draw(np.stack([target[2:].mean(axis=0), tip, right, tip, left]), "C2", 1.2)
         above.grid(False)
         above.locator_params(nbins=5 if axes == 3 else "auto")
         above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", **({"zticks": []} if axes == 3 else {}))
-        handles, texts = above.get_legend_handles_labels()
-        unique = dict(zip(texts, handles, strict=True))
-        above.legend(
-            [*unique.values()], [*unique], fontsize="small", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3
-        )
+        legend_above(above)
         for k, (name, values, si) in enumerate(
             (("speed", self.run.speed, "m/s"), ("steering", self.run.steering, "rad"))
         ):

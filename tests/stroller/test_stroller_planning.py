@@ -160,6 +160,10 @@ def test_a_plan_shows_what_it_achieves(parked, tmp_path):
     assert_close(steering.lines[0].get_ydata(), np.degrees(plan.run.steering))
     names = [text.get_text() for text in above.get_legend().get_texts()]
     assert sorted(names) == ["candidates", "footprint", "goal", "obstacles", "rear axle"]
+    # An arrow from the rear to the front of the goal, (1.9, 0.3) with heading 0.
+    arrow = above.lines[-1].get_xydata()
+    assert_close(arrow[:2, 1], [0.3, 0.3], atol=1e-9)
+    assert_close(arrow[1, 0] - arrow[0, 0], float(plan.problem.footprint.length), rtol=1e-9)
     failed = dataclasses.replace(plan, hindrances=("the footprint overlaps obstacles[0] by 0.592 m",) * 5)
     (title,) = (text for text in failed.plot().texts if "overlaps" in text.get_text())
     title.figure.draw_without_rendering()

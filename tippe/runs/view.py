@@ -24,7 +24,7 @@ from nonholonomic.sweeps import chunk_for
 from nonholonomic.terminal import status_line
 from nonholonomic.text import Unit, readable_unit, with_unit
 from nonholonomic.views.pages import Frame, LiveRun
-from nonholonomic.views.plot import new_figure
+from nonholonomic.views.plot import coloured, new_figure
 
 from ..friction import NoSlip
 from ..model.body import AbstractBody, Top
@@ -359,16 +359,14 @@ def draw_launches(panels: list[Panel], angle: float, dots: str, unit: str = "rad
 
     **Returns:** a matplotlib figure.
     """
-    from matplotlib import colormaps
-
     figure = new_figure(13.0 if len(panels) > 1 else 8.0, 4.2)
     drawings = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for drawing, panel in zip(drawings, panels, strict=True):
-        colours = colormaps["viridis"](np.linspace(0.0, 0.92, len(panel.starts)))
-        for theta, start, end, colour in zip(panel.theta, panel.starts, panel.ends, colours, strict=True):
-            drawing.plot(panel.times, theta, color=colour, label=f"{start:.4g}", linewidth=1.2)
+        coloured(drawing)
+        for theta, start, end in zip(panel.theta, panel.starts, panel.ends, strict=True):
+            (line,) = drawing.plot(panel.times, theta, label=f"{start:.4g}", linewidth=1.2)
             if np.isfinite(end):
-                dot = {"color": colour, "markersize": 9, "markeredgecolor": "black", "zorder": 3}
+                dot = {"color": line.get_color(), "markersize": 9, "markeredgecolor": "black", "zorder": 3}
                 drawing.plot(end, np.interp(end, panel.times, theta), "o", **dot)
         drawing.axhline(angle, color="0.5", linewidth=0.8, linestyle="--")
         drawing.set_title(panel.title)
