@@ -295,12 +295,10 @@ def _mark_words(drawing: "Axes", table: "Table", names: list[str], words: np.nda
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    patches = []
+    patches, (x, y) = [], (table.coords[name] for name in names)
     for word, grey in zip(filter(None, dict.fromkeys(words.ravel().tolist())), GREYS, strict=False):
         mask = np.where(words == word, 1.0, np.nan)
-        drawing.pcolormesh(
-            table.coords[names[0]], table.coords[names[1]], mask.T, shading="nearest", cmap=ListedColormap([grey])
-        )
+        drawing.pcolormesh(x, y, mask.T, shading="nearest", cmap=ListedColormap([grey]))
         patches.append(Patch(color=grey, label=word.replace("_", " ")))
     if patches := [*drawing.get_legend_handles_labels()[0], *patches]:
         # Below the label of the horizontal axis, where it covers no cell.
@@ -484,7 +482,7 @@ def _series_of(fit: "Identification", labels: Sequence[str], unit: Unit) -> list
             without_time += len(indices)
         elif len(curves):
             curve = tuple(part[:, indices].T.ravel() for part in (times_of_curves, factors * curves))
-        name, colour = with_unit(quantity, units[indices[0]]), f"C{len(all_series)}"
+        name, colour = with_unit(quantity, units[indices[0]]), css(COLOURS[len(all_series) % len(COLOURS)])
         texts = [labels[i] for i in indices.tolist()]
         all_series.append(_Series(name, colour, has_time, places, texts, curve, rows[indices]))
     return all_series
@@ -563,7 +561,7 @@ def _draw_data(axes: "Axes", panel: list[_Series]) -> None:
         axes.errorbar(places, rows["value"], rows["error"], fmt=".", color=series.colour, label=text)
         if series.curve is not None:
             text = None if several else "predicted"
-            axes.plot(*series.curve, color=series.colour, alpha=0.5, linewidth=1.2, label=text)
+            axes.plot(*series.curve, color="0.1", linewidth=2.0, zorder=3, label=text)
         else:
             text = "predicted" if series is panel[0] else None
             axes.plot(places, rows["prediction"], "x", color="0.3", label=text)

@@ -152,9 +152,8 @@ class Plan(eqx.Module):
         above.locator_params(nbins=5 if axes == 3 else "auto")
         above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", **({"zticks": []} if axes == 3 else {}))
         legend_above(above)
-        for k, (name, values, si) in enumerate(
-            (("speed", self.run.speed, "m/s"), ("steering", self.run.steering, "rad"))
-        ):
+        curves = ("speed", self.run.speed, "m/s"), ("steering", self.run.steering, "rad")
+        for k, (name, values, si) in enumerate(curves):
             text, factor = in_unit(si, unit)
             panel = figure.add_subplot(grid[k, 1], xlabel="time [s]" if k else "", ylabel=f"{name} [{text}]")
             panel.plot(self.run.t, factor * values, color="C0")
