@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from scipy.interpolate import CubicSpline
 
-from nonholonomic.geometry import Plane
+from nonholonomic.geometry import Plane, scale
 from nonholonomic.terminal import status_line
 from nonholonomic.text import in_unit, readable_unit, require_unit, shown
 from nonholonomic.validation import explaining, require_flag, require_kind, require_package, require_whole
@@ -439,8 +439,8 @@ def track(scene: Scene, plan: Plan) -> Tracker:
 
     **Arguments:**
 
-    - `scene`: the `Scene` that is driven, with the ground of the plan.
-    - `plan`: a `Plan`.
+    - `scene`: the `Scene` that is driven, with the ground of the plan; its tilt and its weight may be others.
+    - `plan`: a `Plan`. After its end, the stroller stays where it is then.
 
     **Returns:** an input for `simulate`: an `equinox.Module` with the gains as numbers, and with `storage(t, motion)`, the
     shaped energy.
@@ -476,7 +476,7 @@ def track(scene: Scene, plan: Plan) -> Tracker:
     length = scene.body.wheelbase
     lowest, highest = plan.problem.limits.arrays(0.0)
     return Tracker(
-        drive=plan.input,
+        drive=dataclasses.replace(plan.input, weight=scale(scene.body.mass * scene.gravity, scene.dynamics.up)),
         pose=jnp.asarray(interpolate(poses)),
         surface=scene.surface,
         wheelbase=length,

@@ -510,7 +510,9 @@ class Drive(eqx.Module):
         per_second = (len(self.steering) - ORDER + 1) / self.duration
         angle, rate = evaluate_spline(self.steering, part), evaluate_spline(self.steering, part, 1) * per_second
         speed, force, torque = (evaluate_spline(spline, part) for spline in (self.front_speed, self.force, self.torque))
-        return angle, rate, speed, force, torque
+        # Afterwards the stroller stays as it is at the end, neither braking nor steering.
+        is_planned = jnp.where(part <= 1.0, 1.0, 0.0)
+        return angle, is_planned * rate, speed, is_planned * force, is_planned * torque
 
     def held(
         self, motion: Motion, angle: Number, rate: Number, speed: Number, force: Number, torque: Number
@@ -582,9 +584,7 @@ class Tracker(eqx.Module):
         """The planned stroller as seen from this one: distances [m] ahead and to the left, and the sine and the cosine of
         the angle to the left at which it heads."""
         pose = evaluate_spline(self.pose, jnp.asarray(t) / self.drive.duration)
-        components = jnp.moveaxis(pose, -1, 0)
-        axes = self.surface.axes
-        heading, target = padded(components[axes:]), padded(components[:axes])
+        target, heading = map(padded, jnp.split(jnp.moveaxis(pose, -1, 0), [self.surface.axes]))
         left = scale(self.side, cross(self.surface.normal(motion.position), motion.heading))
         away = difference(target, motion.position)
         return dot(away, motion.heading), dot(away, left), dot(heading, left), dot(heading, motion.heading)

@@ -249,6 +249,21 @@ def test_a_table_drives_a_plan_as_a_single_ride_does(parked):
     assert np.hypot(*(ends[1] - ends[0])) > 1e-5
 
 
+def test_a_parked_stroller_stays_parked_and_a_slope_is_driven_as_a_level(parked):
+    """After the plan's end nothing brakes or steers; a tracker holds the weight of the scene that is driven."""
+    launch, goal, plan = parked
+    slope = eqx.tree_at(lambda scene: scene.surface, SCENE, stroller.Plane(tilt=0.2))
+    for scene, drive in (
+        (SCENE, plan.input),
+        (SCENE, stroller.track(SCENE, plan)),
+        (slope, stroller.track(slope, plan)),
+    ):
+        run = stroller.simulate(scene, launch, 4.0 * plan.t1, drive, times=[plan.t1, 1.5 * plan.t1, 4.0 * plan.t1])
+        assert_close(run.place, np.tile(goal.place, (3, 1)), atol=0.02)
+        assert_close(run.place[1:], np.tile(run.place[0], (2, 1)), atol=2e-3)
+        assert_close(run.speed[1:], 0.0, atol=1e-3)
+
+
 def freely(goal, t1, limits, steering=0.0, **options):
     """A plan from rest at the origin, with a box out of the way, for the programs of the other plans."""
     away, launch = [stroller.Box((2.0, 4.0), (0.5, 0.5))], stroller.Launch((0.0, 0.0), 0.0, 0.0, steering)
