@@ -40,7 +40,7 @@ MOST_LINES = 450
 MOST_FILES_OUTSIDE = 6
 
 #: The size of the three packages: it may shrink. Imports are a share of the lines of code.
-MOST = {"files": 113, "lines": 25_799, "functions": 2592, "Any": 382, "imports": 0.0789}
+MOST = {"files": 113, "lines": 25_796, "functions": 2592, "Any": 380, "imports": 0.0787}
 
 
 class Arrow(NamedTuple):

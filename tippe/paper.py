@@ -269,7 +269,7 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[vie
         simulate(arena.scene, Launch(theta, arena.spin, *arena.etas[:1]), last, tolerance=options.tolerance)
         for arena in arenas
     )
-    return first.stages(others, label=[f"{arena.name}, θ(0) = {theta:.4g} rad" for arena in arenas])
+    return first.stages(others, label=[f"{arena.name}, θ {theta:.4g} rad" for arena in arenas])
 
 
 def write(options: argparse.Namespace) -> views.pages.Outputs:
