@@ -186,7 +186,7 @@ def test_a_ceiling_start_has_no_contact(rutstam_scene):
             {"solver": diffrax.KenCarp4()},
             r"solver = KenCarp4\(.* must be an adaptive .* for ordinary differential equations",
         ),
-        ({"adjoint": "backwards"}, "adjoint = 'backwards' must be one of Diffrax"),
+        ({"adjoint": "backwards"}, "adjoint = 'backwards' must be RecursiveCheckpointAdjoint"),
         ({"launch": 3}, "launch = 3 must be a Launch"),
         ({"tolerance": math.nan}, "tolerance = nan must be finite"),
     ],

@@ -23,9 +23,8 @@ from nonholonomic.views import (
     Show,
     Stage,
     Trace,
-    page,
 )
-from nonholonomic.views.pages import Viewable, picture_as_html
+from nonholonomic.views.pages import Viewable, page, picture_as_html
 from nonholonomic.views.plot import draw_series
 from nonholonomic.views.stage import arena, ball, quaternion
 
