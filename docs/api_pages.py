@@ -230,7 +230,7 @@ MEMBERS = {
     "nonholonomic.sweeps.Quantity": "of",
     "nonholonomic.identification.AbstractRecording": "columns seen labels measurements",
     "nonholonomic.identification.Quantities": "of",
-    "nonholonomic.identification.LogDensity": "of names units start values predict replicate",
+    "nonholonomic.identification.LogDensity": "of log_priors names units start values predict replicate",
     "nonholonomic.sweeps.Tabular": "readable portrait_axes to_table to_xarray save portrait",
     "nonholonomic.derivatives.AbstractDifferentiableSolve": "in_blocks movable absent solve value_and_tangents prefers_adjoint "
     "differentiable push_forward pull_back for_parts",

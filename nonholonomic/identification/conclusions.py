@@ -137,7 +137,11 @@ def judge(
                 "there are no errors and intervals: start closer, give bounds or priors, or fix numbers",
             ),
         ),
-        *(_undetermined(words) for words in unseen),
+        *(
+            f"the data do not determine {' and '.join(names)}: fix {'one' if len(names) > 1 else 'it'}, or give a prior"
+            # From words such as "mass +1 %, length -1 %".
+            for names in ([re.split(r" [+-]", part)[0] for part in words.split(", ")] for words in unseen)
+        ),
         *sentences(
             (len(minima) > 1, f"the data allow {len(minima)} minima, which the details list: state a prior or bounds"),
             (
@@ -186,12 +190,6 @@ def judge(
         k=sample.k,
         minima=minima,
     )
-
-
-def _undetermined(words: str) -> str:
-    """The concern about a combination of parameters, which is given in words such as "mass +1 %, length -1 %"."""
-    names = [re.split(r" [+-]", part)[0] for part in words.split(", ")]
-    return f"the data do not determine {' and '.join(names)}: fix {'one' if len(names) > 1 else 'it'}, or give a prior"
 
 
 def sentences(*table: tuple[object, str]) -> tuple[str, ...]:

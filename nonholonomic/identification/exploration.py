@@ -470,7 +470,7 @@ class Explorer(NamedTuple):
         likelihood = np.sum(each[:, ~estimated], axis=1)
         for scales, logs in _by_error(measurements, predictions, residual):
             likelihood = likelihood + np.logaddexp.reduce(logs, axis=1) + np.log(scales[:, 1] - scales[:, 0])
-        prior = np.asarray(self.density.problem.unknowns.log_priors(batch))
+        prior = np.asarray(self.density.log_priors(batch))
         prior = np.where(inside, prior[: len(points)], -np.inf)
         groups = np.stack([np.sum(each[:, self.group == k], axis=1) for k in np.unique(self.group)], axis=1)
         # 0 in the region; outside, less with the square of the distance.

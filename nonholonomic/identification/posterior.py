@@ -719,9 +719,8 @@ class LogDensity(eqx.Module):
         random, predicted = np.random.default_rng(seed), np.asarray(self.predict(coordinates))
         heavy = np.isfinite(freedom := self.measurements.student)
         noise = random.normal(size=predicted.shape)
-        noise /= np.where(
-            heavy, np.sqrt(random.chisquare(np.where(heavy, freedom, 1.0), predicted.shape) / freedom), 1.0
-        )
+        squares = random.chisquare(np.where(heavy, freedom, 1.0), predicted.shape)
+        noise /= np.where(heavy, np.sqrt(squares / freedom), 1.0)
         errors = jax.vmap(lambda point: self._with_errors(point).error)(jnp.asarray(coordinates))
         return predicted + np.asarray(errors) * noise
 
@@ -729,10 +728,14 @@ class LogDensity(eqx.Module):
     def __call__(self, coordinates: Float[Array | np.ndarray, " unknowns"]) -> Float[Array, ""]:
         return self.of_prediction(jnp.asarray(coordinates), self.predict(jnp.asarray(coordinates)[None])[0])
 
+    # Programs outside of the repository call this, and `_with_errors`.
+    def log_priors(self, coordinates: Float[Array | np.ndarray, "rows unknowns"]) -> Float[Array, " rows"]:
+        """The log prior densities at several sets of coordinates."""
+        return self.problem.unknowns.log_priors(coordinates)
+
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
         """The log density at given coordinates, for given predictions of the model."""
-        log_prior = self.problem.unknowns.log_prior(coordinates)
-        return self._with_errors(coordinates).log_likelihood(prediction) + log_prior
+        return self._with_errors(coordinates).log_likelihood(prediction) + self.problem.unknowns.log_prior(coordinates)
 
     @status_line("simulating")
     def value_and_gradient(

@@ -79,7 +79,7 @@ def test_priors_and_bounds_stay_with_their_unknowns(names):
     density = LogDensity.of(model, data, {name: KINDS[name] for name in names}, function)
     points = np.asarray(density.start) + 0.3 * np.random.default_rng(0).normal(size=(4, 4))
     expected = sum(expected_log_prior(name, points[:, k]) for k, name in enumerate(names))
-    assert_close(density.problem.unknowns.log_priors(points), expected, rtol=1e-10)
+    assert_close(density.log_priors(points), expected, rtol=1e-10)
 
     def single(point, prediction):
         """The density less the likelihood with the errors of the point."""
