@@ -137,8 +137,9 @@ def solve_for_samples(
     arrays, rest = eqx.partition((numbers, (times, as_number(t1), settings, grid), others), eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
     run = differentiable_solve(sampling(build, axes, structure, rest), *leaves)
-    later = jnp.where(run.status == REACHED_END, t1 - jax.lax.stop_gradient(t1), 0.0)
-    return run._replace(end_time=run.end_time + later)
+    # A number that is zero, and whose derivative is that of the horizon.
+    extension = jnp.where(run.status == REACHED_END, t1 - jax.lax.stop_gradient(t1), 0.0)
+    return run._replace(end_time=run.end_time + extension)
 
 
 #: Build a problem from some modules (scene, launch, ...) and a number of cells, `None` for a single run.

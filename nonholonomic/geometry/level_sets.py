@@ -77,8 +77,8 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...], vector: bool 
         function = with_own_numbers(value, *at)
         return function if vector else Held(parted(function))
     # Equinox warns of the arrays of a tree, such as JAX's partial functions, but not of those of its method.
-    given = GivenFunction(value if jax.tree_util.all_leaves([value]) else value.__call__, program)
-    return Plain(given, "(n)->()" if vector else None)
+    function = GivenFunction(value if jax.tree_util.all_leaves([value]) else value.__call__, program)
+    return Plain(function, "(n)->()" if vector else None)
 
 
 def _takes_lanes(function: Any, count: int) -> bool:

@@ -120,9 +120,9 @@ def judge(
     is_outside = np.abs(distribution.estimate - region.middle) > region.half_width
     outside = ", ".join(np.array(explorer.density.problem.names)[is_outside])
     fixed = " and ".join(getattr(explorer.density.problem.model, "fixed", ()))
-    far = [f"{labels[k]} ({abs(scores[k]):.0f} errors)" for k in np.flatnonzero(np.abs(scores) > OUTLYING)]
+    outliers = [f"{labels[k]} ({abs(scores[k]):.0f} errors)" for k in np.flatnonzero(np.abs(scores) > OUTLYING)]
     # A wrong model, or too small an error, puts many measurements far away.
-    outlying = ", ".join(far[:MOST_NAMED]) if len(far) <= MOST_OUTLYING * len(scores) else ""
+    outlying = ", ".join(outliers[:MOST_NAMED]) if len(outliers) <= MOST_OUTLYING * len(scores) else ""
     impossible, share = without_prediction(explorer, sample, distribution)
     minima, concerns, notes = (), (), ()
     if distribution.kind == "weights":

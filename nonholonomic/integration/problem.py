@@ -691,9 +691,8 @@ def require_adaptive(solver: object, others: str = "") -> None:
 def require_adjoint(adjoint: object) -> None:
     """Raise `ValueError` unless this is `None` or an adjoint method of Diffrax whose derivatives are those of the run.
 
-    `DirectAdjoint` repeats blocks of 16 steps on its way back. Their lengths depend on errors that consist of rounding at
-    tight tolerances, so they are others than on the way forward: gradients of rides were wrong by 5e-4 at a tolerance of
-    1e-10, and those of Duffing's oscillator by Diffrax alone by 7e-5 at 1e-13. `ImplicitAdjoint` is for steady states.
+    On its way back, `DirectAdjoint` repeats blocks of steps, which at tight tolerances get other lengths by rounding: at 1e-10,
+    gradients of rides were wrong by 5e-4. `ImplicitAdjoint` is for steady states.
 
     **Example:**
 

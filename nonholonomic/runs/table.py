@@ -507,8 +507,7 @@ def table_of(
     labels = model.label([*named, *(name for name in sensitivities if name not in named)])
     grid = [axis(labels[name][0], name, labels[name][1], values, labels[name][2]) for name, values in named.items()]
     for name in sensitivities:
-        is_of_several = "[*]" in name and name not in named
-        if is_of_several and not eqx.tree_equal(model, model.replaced({name: model.value(name)})):
+        if "[*]" in name and name not in named and not eqx.tree_equal(model, model.replaced({name: model.value(name)})):
             raise ValueError(f"sensitivities: {name!r} stands for several numbers, which differ; name them one by one")
     slopes = {name: f"time_by_{labels[name][0]}" for name in sensitivities}
     job = TableJob(model, form, float(t1), crossing, options.settings, slopes, options.errors, samples, timed)

@@ -442,7 +442,7 @@ def require_labels(label: Label, runs: Sequence[object]) -> list[str]:
     labels = [label] if isinstance(label, str) else label
     if not isinstance(labels, list | tuple) or [type(text) for text in labels] != [str] * len(runs):
         raise ValueError(f"label = {shown(label)} must have {len(runs)} texts, one for each run")
-    return list(labels) if len(labels) == 1 else distinguishing_labels([(text,) for text in labels])
+    return distinguishing_labels([(text,) for text in labels])
 
 
 # Films, recorded by a browser.

@@ -380,8 +380,11 @@ def draw_series(
     """
     if ax is not None and len(names) > 1:
         raise ValueError(f"ax takes one quantity, not {len(names)}: {', '.join(names)}")
-    figure, panels = new_figure(PANEL[0], 1.5 + PANEL[1] * len(names)), [] if ax is None else [ax]
-    panels = panels or [coloured(panel) for panel in figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]]
+    if ax is None:
+        figure = new_figure(PANEL[0], 1.5 + PANEL[1] * len(names))
+        panels = list(map(coloured, figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]))
+    else:
+        figure, panels = None, [ax]
     explained: set[str] = set()
     for panel, name in zip(panels, names, strict=True):
         for table, label, marked in zip(tables, labels, marks, strict=True):
@@ -414,7 +417,7 @@ def draw_series(
         legend_above(panel, explained)
         explained.update(panel.get_legend_handles_labels()[1])
     panels[-1].set_xlabel(tables[0].label("time"))
-    return figure if ax is None else ax
+    return figure or panels[0]
 
 
 def legend_above(panel: "Axes", explained: Container[str] = ()) -> None:

@@ -314,9 +314,8 @@ class AbstractTrajectory(AbstractRun):
     def afterwards(self) -> Int[Array, ""]:
         """What a top that turned over has done by the last time, as an index of `AFTERWARDS`: it fell back if it is below
         90 degrees, or if it stands on its sphere again after its stem carried it."""
-        is_told = self.scene.has_stem and self.scene.contact == "hybrid"
-        again = is_told and (self.contact[-1] >= 0) & (self.contact[-1] != 1)
-        return jnp.where((self.theta[-1] < 0.5 * jnp.pi) | again, 1, 0)
+        stands = self.scene.has_stem and (self.contact[-1] >= 0) & (self.contact[-1] != 1)
+        return jnp.where((self.theta[-1] < 0.5 * jnp.pi) | stands, 1, 0)
 
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:
@@ -358,7 +357,7 @@ class AbstractTrajectory(AbstractRun):
         """Whether and when the top turned over, as text."""
         body, time, afterwards = self.scene.body, self.inversion_time, AFTERWARDS[int(self.afterwards)]
         if np.isfinite(time):
-            stem = ": the stem first carries it" if self.scene.has_stem and self.scene.contact == "hybrid" else ""
+            stem = ": the stem first carries it" if self.scene.has_stem else ""
             return f"turned over{stem} at {time:.6g} s" + (f", but {afterwards}" if afterwards else "")
         reason = ""
         if isinstance(self.scene.friction, Frictionless):

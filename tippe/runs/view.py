@@ -361,8 +361,7 @@ def draw_launches(panels: list[Panel], angle: float, dots: str, unit: str = "rad
     """
     figure = new_figure(13.0 if len(panels) > 1 else 8.0, 4.2)
     drawings = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for drawing, panel in zip(drawings, panels, strict=True):
-        coloured(drawing)
+    for drawing, panel in zip(map(coloured, drawings), panels, strict=True):
         for theta, start, end in zip(panel.theta, panel.starts, panel.ends, strict=True):
             (line,) = drawing.plot(panel.times, theta, label=f"{start:.4g}", linewidth=1.2)
             if np.isfinite(end):

@@ -317,7 +317,7 @@ def test_runs_of_one_colour_have_other_dashes(browser):
         " curves: [{ name: 'a', unit: 'm', factor: 1, values: [k, k] }] }));"
         "runs.forEach((run, k) => { run.dashes = views.dashesOf(runs, k); });"
         "const box = document.createElement('div'); document.body.append(box);"
-        "const made = new views.Strips(box, () => runs, () => 0), [strip] = made.strips; made.draw(0);"
+        "const strips = new views.Strips(box, () => runs, () => 0), [strip] = strips.strips; strips.draw(0);"
         "const { passed, x0, x1 } = strip;"
         "const count = (canvas, y, x, width) => canvas.getContext('2d').getImageData(x, y, width, 1).data"
         ".filter((_, k) => k % 4 === 3).reduce((sum, alpha) => sum + (alpha > 128), 0) / width;"
